@@ -71,7 +71,9 @@ MUTANTS = [
         ("twin/world/chart.py", "np.float32(t.prior_offset_m)", "np.float32(-t.prior_offset_m)", "world_floor_following"),
         ("controllers/survey_plan.py", "per_px = self.altitude_m / self.focal_px", "per_px = self.altitude_m * 2 / self.focal_px", "controllers_lawnmower"),
         # scenes
-        ("scenes/builder.py", "down = (ny - 1 - np.arange(rows.start, rows.stop)) * (h / (ny - 1))", "down = np.arange(rows.start, rows.stop) * (h / (ny - 1))", "scenes_builder imaging_renderer"),
+        ("scenes/builder.py", "mass_kg, np.zeros(3), np.array(inertia_kgm2)", "mass_kg, np.ones(3), np.array(inertia_kgm2)", "scenes_builder"),
+        ("twin/imaging/scene/floor_albedo.py", "high - north[u] * per_y", "north[u] * per_y", "imaging_renderer"),
+        ("twin/imaging/scene/floor_raster.py", "(q > row[u])", "(q >= 0)", "imaging_renderer"),
         # simulate
         ("twin/simulate/hydrodynamics.py", "(hull.buoyancy_n - hull.weight_n) * up[k]", "(hull.weight_n - hull.buoyancy_n) * up[k]", "simulate_hydrodynamics"),
         ("twin/simulate/hydrodynamics.py", "total[k, k] += hull.inertia[k]", "total[k, k] = hull.inertia[k]", "simulate_hydrodynamics"),

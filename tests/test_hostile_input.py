@@ -96,7 +96,6 @@ def test_a_study_of_too_many_surveys_is_refused(tmp_path):
 def command(monkeypatch, tmp_path, capsys):
     """Runs the command line in an empty folder; returns (exit status, stdout, stderr). Other exceptions are raised."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "_require_rendering", lambda: None)
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["twin", *words])

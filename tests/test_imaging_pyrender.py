@@ -16,13 +16,12 @@ from twin.core.records import StereoRig
 from twin.imaging.scene import object_view
 from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.imaging.scene.renderer import Renderer
-from twin.scenes.builder import build
 from twin.terrains import TextureSource
 from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.shapes import build_shape
 
 W, H, VFOV = 160, 120, 45.0
-#: Runs in a separate process, as pyrender closes the display of MuJoCo. Without multisampling, which biases the depth.
+#: Runs in a separate process, as pyrender closes other OpenGL displays. Without multisampling, which biases the depth.
 PYRENDER = """
 import sys
 import pyglet
@@ -81,9 +80,8 @@ def poses() -> np.ndarray:
 
 def test_depth_agrees_with_pyrender(poses: np.ndarray, tmp_path: Path) -> None:
     terrain = terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, TextureSource(0.02), 5)
-    world = build(terrain, 0.01)
-    with Renderer(world, W, H, VFOV) as renderer:
-        ours = np.array([renderer.render(pose)[1] for pose in poses])
+    renderer = Renderer(terrain, W, H, H / 2 / float(np.tan(np.deg2rad(VFOV / 2))))
+    ours = np.array([renderer.render(pose)[1] for pose in poses])
     theirs = pyrender_depths(*triangles(terrain), poses, tmp_path)
     inside = np.isfinite(ours)
     assert ((theirs > 0) != inside).mean() < 1e-3  # pixels on the edge of the floor

@@ -1,24 +1,21 @@
-"""Renderer against ray casting, terrain heights and projected patterns, all independent of OpenGL."""
+"""Renderer against rays and images of MuJoCo, terrain heights and projected patterns."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from mujoco_floor import floor_model, image, ray_lengths
 
-from twin import scenes, terrains
+from twin import terrains
 from twin.core import geometry
-from twin.errors import TwinError
-from twin.imaging.scene.renderer import Renderer, linear_depth, visible_tiles
-from twin.scenes.builder import SceneModel, build
-from twin.scenes.gl import mujoco
+from twin.imaging.scene.renderer import Renderer
+from twin.imaging.scene.texture_levels import levels_of
 from twin.terrains import Terrain, TextureSource
 
 W, H, VFOV = 160, 120, 45.0
+FOCAL_PX = float(H / 2 / np.tan(np.deg2rad(VFOV) / 2))
 POSES = [
     geometry.pose(geometry.rotation_from_rpy(*map(float, rpy)) @ geometry.BODY_FROM_DOWN_CAMERA, np.array(position))
     for rpy, position in [
@@ -29,79 +26,127 @@ POSES = [
 ]
 
 
-def world_of(terrain: Terrain) -> SceneModel:
-    return build(terrain, 0.01)
-
-
 @pytest.fixture(scope="module")
-def world() -> SceneModel:
-    return world_of(terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, TextureSource(0.003), 5))
+def terrain() -> Terrain:
+    return terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, TextureSource(0.003, walls=False), 5)
 
 
-@pytest.fixture(scope="module")
-def renderer(world: SceneModel) -> Iterator[Renderer]:
-    with Renderer(world, W, H, VFOV) as opened:
-        yield opened
+def render(terrain: Terrain, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return Renderer(terrain, W, H, FOCAL_PX).render(pose)
 
 
-def pixel_rays(width_px: int, height_px: int, vfov_deg: float) -> np.ndarray:
-    """Returns the viewing directions (height, width, 3) of the pixel centres in the camera, scaled to z = 1."""
-    focal_px = height_px / 2 / float(np.tan(np.deg2rad(vfov_deg) / 2))
-    u, v = np.meshgrid(np.arange(width_px) - (width_px - 1) / 2, np.arange(height_px) - (height_px - 1) / 2)
-    return np.stack([u / focal_px, v / focal_px, np.ones_like(u)], axis=-1)
+def pixel_rays() -> np.ndarray:
+    """Returns the viewing directions (H, W, 3) of the pixel centres in the camera, scaled to z = 1."""
+    u, v = np.meshgrid(np.arange(W) - (W - 1) / 2, np.arange(H) - (H - 1) / 2)
+    return np.stack([u / FOCAL_PX, v / FOCAL_PX, np.ones_like(u)], axis=-1)
 
 
-def ray_depths(world: SceneModel, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Returns the depths (n,) [m] of pixels (n, 2) by ray casting in MuJoCo; inf where there is no floor."""
-    data = mujoco.MjData(world.model)
-    data.qpos[2] = 100.0
-    mujoco.mj_forward(world.model, data)
-    rays = pixel_rays(W, H, VFOV)[pixels[:, 1], pixels[:, 0]]
-    geom, result = np.zeros(1, np.int32), []
-    for ray in rays:
-        direction = pose[:3, :3] @ ray / np.linalg.norm(ray)
-        distance = mujoco.mj_ray(world.model, data, pose[:3, 3], direction, None, 1, -1, geom, None)
-        result.append(distance / np.linalg.norm(ray) if distance >= 0 else np.inf)
-    return np.array(result)
+def errors_of_depth(terrain: Terrain, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Returns the errors (n,) [m] of the rendered depths at pixels (n, 2) against rays of MuJoCo; inf: floor or not."""
+    _, depth = render(terrain, pose)
+    rays = pixel_rays()[pixels[:, 1], pixels[:, 0]]
+    expected = ray_lengths(floor_model(terrain), pose[:3, 3], rays @ pose[:3, :3].T)
+    rendered = depth[pixels[:, 1], pixels[:, 0]]
+    both_none = np.isinf(expected) & np.isinf(rendered)
+    assert not both_none.all()
+    return np.where(both_none, 0.0, np.abs(np.subtract(rendered, expected, where=~both_none, out=np.zeros(len(rays)))))
+
+
+def some_pixels(n: int) -> np.ndarray:
+    return np.random.default_rng(1).integers(0, (W, H), (n, 2))
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_depth_agrees_with_rays_through_the_pixel_centres(
-    world: SceneModel, renderer: Renderer, pose: np.ndarray
-) -> None:
-    _, depth = renderer.render(pose)
-    pixels = np.random.default_rng(1).integers(0, (W, H), (400, 2))
-    rendered, expected = depth[pixels[:, 1], pixels[:, 0]], ray_depths(world, pose, pixels)
-    inside = np.isfinite(expected)
-    assert np.array_equal(np.isfinite(rendered), inside)
-    error = np.abs(rendered[inside] - expected[inside])
+def test_depth_agrees_with_rays_through_the_pixel_centres(terrain: Terrain, pose: np.ndarray) -> None:
+    error = errors_of_depth(terrain, pose, some_pixels(400))
     # single precision is about 1 um at a few metres from the origin
-    assert np.median(error) < 5e-6 and np.percentile(error, 98) < 2e-5
+    assert np.median(error) < 5e-6 and np.percentile(error, 98) < 2e-5 and (error < 1e-3).mean() >= 0.995
+
+
+def rough(spacing_m: float, steps_m: float, n: int) -> Terrain:
+    """Returns a floor of n x n cells with random heights, much steeper than any real one, around a hill."""
+    at = spacing_m * (np.arange(n + 1) - n / 2)
+    hill = 0.5 * np.exp(-2 * (at[:, None] ** 2 + at**2))
+    height = hill + np.random.default_rng(7).uniform(0, steps_m, (n + 1, n + 1))
+    return Terrain(
+        height.astype(np.float32), spacing_m, at[0], at[0], np.full((8, 8, 3), 100, np.uint8), n * spacing_m / 8
+    )
+
+
+@pytest.mark.parametrize(("spacing_m", "steps_m", "n"), [(0.006, 0.03, 200), (0.06, 0.15, 40), (0.7, 0.3, 12)])
+def test_depth_agrees_with_rays_for_cells_of_any_size(spacing_m: float, steps_m: float, n: int) -> None:
+    """Cells of 0.4, 4 and 46 pixels, which hide one another, under a camera tilted by 20 deg."""
+    pose = geometry.pose(
+        geometry.rotation_from_rpy(0.3, 0.2, 0.7) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0.2, -0.1, 2.1])
+    )
+    error = errors_of_depth(rough(spacing_m, steps_m, n), pose, some_pixels(3000))
+    assert (error < 1e-3).mean() >= 0.999
+
+
+def test_triangles_that_reach_behind_the_camera_are_clipped_at_the_near_plane() -> None:
+    """Camera 0.3 m above cells of 2 m, almost level: the triangles below it have corners behind it."""
+    floor = rough(2.0, 0.0, 8)
+    floor = replace(floor, height_m=floor.height_m / 100)  # MuJoCo needs some relief
+    pose = geometry.pose(
+        geometry.rotation_from_rpy(0.0, -1.2, 0.3) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0.3, 0.2, 0.3])
+    )
+    pixels = some_pixels(2000)
+    assert np.median(errors_of_depth(floor, pose, pixels)) < 1e-5
+    assert (errors_of_depth(floor, pose, pixels) < 1e-3).mean() >= 0.999
+    down = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.3, 0.2, 0.04]))
+    assert np.all(np.isinf(render(floor, down)[1]))  # nearer than the near plane
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_rendered_points_are_on_the_terrain(world: SceneModel, renderer: Renderer, pose: np.ndarray) -> None:
-    _, depth = renderer.render(pose)
+def test_rendered_points_are_on_the_terrain(terrain: Terrain, pose: np.ndarray) -> None:
+    _, depth = render(terrain, pose)
     valid = np.isfinite(depth)
-    points = geometry.transform(pose, pixel_rays(W, H, VFOV)[valid] * depth[valid][:, None].astype(np.float64))
-    error = np.abs(points[:, 2] - world.terrain.height_at(points[:, 0], points[:, 1]))
+    points = geometry.transform(pose, pixel_rays()[valid] * depth[valid][:, None].astype(np.float64))
+    error = np.abs(points[:, 2] - terrain.height_at(points[:, 0], points[:, 1]))
     assert np.nanmedian(error) < 5e-6 and np.nanpercentile(error, 98) < 2e-5
     assert np.isnan(error).mean() < 0.002  # pixels on the edge of the floor
 
 
-def test_tile_borders_are_invisible(monkeypatch: pytest.MonkeyPatch, world: SceneModel, renderer: Renderer) -> None:
-    """A floor of 12 tiles is rendered like a floor of one tile."""
-    tiled = [renderer.render(pose) for pose in POSES]
-    monkeypatch.setattr(scenes.builder, "TILE_CELLS", 1000)
-    with Renderer(world_of(world.terrain), W, H, VFOV) as untiled:
-        for (albedo, depth), pose in zip(tiled, POSES, strict=True):
-            single_albedo, single_depth = untiled.render(pose)
-            both = np.isfinite(depth) & np.isfinite(single_depth)
-            assert (np.isfinite(depth) != np.isfinite(single_depth)).mean() < 1e-3
-            off = np.abs(depth[both] - single_depth[both]) > 1e-4
-            assert off.mean() < 1e-3  # silhouettes may fall on the other side of a pixel centre
-            difference = np.abs(albedo.astype(int) - single_albedo.astype(int))[both].max(axis=-1)
-            assert np.percentile(difference, 99) <= 2 and (difference > 8).mean() < 1e-3
+@pytest.mark.parametrize("height_m", [0.9, 1.5, 2.5])
+def test_albedo_agrees_with_the_image_of_mujoco(terrain: Terrain, height_m: float) -> None:
+    """At up to 5 texels per pixel. Powers of two, for which OpenGL's levels are means of 2 x 2 texels, too."""
+    texture = np.ascontiguousarray(terrain.texture[:1024, :2048])
+    terrain = replace(terrain, texture=texture, texture_px_m=7 / 2048)
+    pose = geometry.pose(
+        geometry.rotation_from_rpy(0.15, -0.1, 0.5) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.2, height_m])
+    )
+    albedo, _ = render(terrain, pose)
+    difference = np.abs(albedo.astype(int) - image(floor_model(terrain), (H, W), FOCAL_PX, pose))
+    assert albedo.std() > 10
+    assert difference.mean() < 1.0 and np.percentile(difference, 99.5) <= 3
+
+
+def test_a_gradient_of_colours_is_rendered_exactly_at_every_level() -> None:
+    """Interpolation and averages keep a linear function: the colour of a point does not depend on the distance."""
+    ramp = np.rint(np.linspace(0, 255, 511)).astype(np.uint8)
+    texture = np.repeat(np.repeat(ramp[None, :, None], 511, axis=0), 3, axis=2)
+    floor = Terrain(np.zeros((3, 3), np.float32), 2.0, -2.0, -2.0, texture, 4 / 511)
+    for height_m in (0.3, 1.3, 2.9, 4.0):
+        pose = geometry.pose(
+            geometry.rotation_from_rpy(0.05, 0.1, 1.0) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0, height_m])
+        )
+        albedo, depth = render(floor, pose)
+        x = pose[0, 3] + (pixel_rays() @ pose[0, :3]) * np.where(np.isfinite(depth), depth, 100.0)
+        inside = (np.abs(x) < 1.9) & np.isfinite(depth)
+        expected = 255 * ((x + 2) / 4 * 511 - 0.5) / 510
+        assert (
+            np.abs(albedo[..., 1] - expected)[inside].max() < 1.5
+        )  # rounded in the texture, in levels and in the image
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (3, 2), (7, 512), (513, 1025)])
+def test_each_level_has_half_the_rows_and_columns_of_the_one_before_rounded_up(shape: tuple[int, int]) -> None:
+    texture = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
+    levels = levels_of(texture)
+    assert levels.finest.base is texture or np.shares_memory(levels.finest, texture)
+    sizes = levels.table[:, 1:]
+    assert np.array_equal(sizes[1:], -(-sizes[:-1] // 2)) and np.array_equal(sizes[0], shape) and sizes[-1].min() == 2
+    assert len(levels.coarser) == 3 * sizes[1:].prod(axis=1).sum()
 
 
 def test_a_uniform_colour_is_rendered_exactly() -> None:
@@ -111,8 +156,7 @@ def test_a_uniform_colour_is_rendered_exactly() -> None:
         terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m,
         np.broadcast_to(colour, terrain.texture.shape).copy(), terrain.texture_px_m,
     )  # fmt: skip
-    with Renderer(world_of(painted), W, H, VFOV) as opened:
-        albedo, _ = opened.render(POSES[0])
+    albedo, _ = render(painted, POSES[0])
     assert np.all(albedo == colour)
 
 
@@ -137,12 +181,10 @@ def test_a_pattern_is_rendered_at_its_projection() -> None:
     pose = geometry.pose(
         geometry.rotation_from_rpy(0.03, 0.02, 0.4) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0, 0, 2.0])
     )
-    with Renderer(world_of(terrain), 320, 240, VFOV) as opened:
-        albedo, _ = opened.render(pose)
+    albedo, _ = Renderer(terrain, 320, 240, 2 * FOCAL_PX).render(pose)
     points = np.column_stack([dots, terrain.height_at(dots[:, 0], dots[:, 1])])
     camera = geometry.transform(geometry.inverse(pose), points)
-    focal_px = 120 / np.tan(np.deg2rad(VFOV) / 2)
-    expected = camera[:, :2] / camera[:, 2:] * focal_px + [159.5, 119.5]
+    expected = camera[:, :2] / camera[:, 2:] * 2 * FOCAL_PX + [159.5, 119.5]
     error = np.array([centroid(albedo[..., 0], uv) - uv for uv in expected if inside(uv)])
     assert len(error) >= 15 and np.abs(error).max() < 0.1 and np.abs(error.mean(axis=0)).max() < 0.03
 
@@ -165,32 +207,21 @@ def test_texture_keeps_detail_of_one_pixel() -> None:
     texel_m = 0.01
     noise = np.where(np.random.default_rng(0).random((300, 300, 1)) < 0.5, 0, 255).astype(np.uint8).repeat(3, axis=2)
     terrain = Terrain(np.zeros((61, 61), np.float32), 0.05, -1.5, -1.5, noise, texel_m)
-    focal_px = H / 2 / np.tan(np.deg2rad(VFOV) / 2)
-    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.005, 0.005, texel_m * focal_px]))
-    with Renderer(world_of(terrain), W, H, VFOV) as opened:
-        albedo, _ = opened.render(pose)
+    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.005, 0.005, texel_m * FOCAL_PX]))
+    albedo, _ = render(terrain, pose)
     assert albedo[..., 0].std() > 0.5 * noise[..., 0].std()
 
 
-def test_hidden_tiles_do_not_change_the_image(world: SceneModel, renderer: Renderer) -> None:
-    tangents = np.tan(np.deg2rad(VFOV) / 2) * np.array([W / H, 1.0])
-    for pose in POSES:
-        albedo, depth = renderer.render(pose)
-        assert 0 < visible_tiles(world, pose, tangents).sum() < len(world.tile_geom_ids)
-        renderer._show(np.ones(len(world.tile_geom_ids), dtype=bool))
-        mujoco.mjr_render(renderer._rect, renderer._scene, renderer._context)
-        mujoco.mjr_readPixels(renderer._rgb, renderer._z, renderer._rect, renderer._context)
-        assert np.array_equal(albedo, renderer._rgb[::-1])
-        assert np.array_equal(depth, linear_depth(renderer._z[::-1]))
+def test_depth_is_infinite_and_the_image_black_where_there_is_no_floor(terrain: Terrain) -> None:
+    albedo, depth = render(terrain, geometry.pose(np.eye(3), np.array([0.0, 0.0, 2.0])))
+    assert np.all(np.isinf(depth)) and not albedo.any()
+    beside = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([3.5, 0.0, 2.2]))  # half of it
+    albedo, depth = render(terrain, beside)
+    assert 0.4 < np.isinf(depth).mean() < 0.6 and not albedo[np.isinf(depth)].any() and albedo[np.isfinite(depth)].all()
 
 
-def test_depth_is_infinite_where_there_is_no_floor(renderer: Renderer) -> None:
-    up = geometry.pose(np.diag([1.0, 1.0, 1.0]), np.array([0.0, 0.0, 2.0]))
-    _, depth = renderer.render(up)
-    assert np.all(np.isinf(depth))
-
-
-def test_images_are_copies_and_rendering_is_reproducible(renderer: Renderer) -> None:
+def test_images_are_copies_and_rendering_is_reproducible(terrain: Terrain) -> None:
+    renderer = Renderer(terrain, W, H, FOCAL_PX)
     albedo, depth = renderer.render(POSES[0])
     kept = albedo.copy(), depth.copy()
     renderer.render(POSES[1])
@@ -199,37 +230,9 @@ def test_images_are_copies_and_rendering_is_reproducible(renderer: Renderer) -> 
     assert np.array_equal(again[0], albedo) and np.array_equal(again[1], depth)
 
 
-def test_linear_depth_inverts_the_projection() -> None:
-    near, far = np.float32(0.05), np.float32(100.0)
-    depth = np.array([0.05, 0.3, 2.2, 3.3, 50.0])
-    z = (near * (far - depth) / (depth * (far - near))).astype(np.float32)
-    assert linear_depth(z) == pytest.approx(depth, rel=1e-5)
-    assert np.isinf(linear_depth(np.zeros(1, np.float32))[0])
-
-
-def test_missing_opengl_is_reported_with_the_package_to_install(
-    monkeypatch: pytest.MonkeyPatch, world: SceneModel
-) -> None:
-    monkeypatch.setattr(scenes.gl, "_loaded", lambda: (sys.modules["mujoco"], "ImportError: no libEGL.so.1"))
-    with pytest.raises(TwinError, match=r"no libEGL.*apt-get install -y libegl1"):
-        Renderer(world, W, H, VFOV)
-
-
-def test_without_egl_mujoco_loads_and_rendering_reports_the_reason() -> None:
-    """Runs in a separate process in which PyOpenGL cannot load EGL."""
-    code = """
-import sys
-sys.modules["OpenGL.EGL"] = None
-from twin.scenes.gl import mujoco, offscreen_context
-from twin.errors import TwinError
-model = mujoco.MjModel.from_xml_string("<mujoco/>")
-try:
-    offscreen_context(64, 48)
-except TwinError as error:
-    print(error)
-"""
-    environment = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("rendering: no OpenGL on this machine: ")
-    assert "apt-get install -y libegl1" in done.stdout
+def test_the_image_does_not_depend_on_the_number_of_bands(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
+    images = []
+    for processors in (1, 2):
+        monkeypatch.setattr("twin.core.threads._n_processors", lambda n=processors: n)
+        images.append(render(terrain, POSES[2]))
+    assert all(np.array_equal(*pair) for pair in zip(*images, strict=True))

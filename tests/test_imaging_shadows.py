@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mujoco_floor import floor_model, ray_lengths
 
 from twin import terrains
 from twin.core import geometry
@@ -23,8 +24,7 @@ from twin.imaging.light.spread import NODES_M
 from twin.imaging.light.water import medium
 from twin.imaging.scene.renderer import Renderer
 from twin.scenario.model import LampConfig, Scenario, SunConfig, WaterConfig
-from twin.scenes.builder import FLOOR_GROUP, SceneModel, build
-from twin.scenes.gl import mujoco
+from twin.scenes.gl import MjModel
 from twin.terrains import TextureSource
 
 LAMPS = [{"position_m": (0.25, 0.6, -0.05), "pan_deg": -15.0}, {"position_m": (0.25, -0.6, -0.05), "pan_deg": 15.0}]
@@ -37,7 +37,6 @@ SCENARIO = Scenario.model_validate(
     }
 )
 RIG = SCENARIO.believed_rig()
-VFOV = float(np.rad2deg(2 * np.arctan(RIG.height_px / 2 / RIG.focal_px)))
 POSES = [
     geometry.pose(geometry.rotation_from_rpy(*map(float, rpy)) @ geometry.BODY_FROM_DOWN_CAMERA, np.array(position))
     for rpy, position in [((0.0, 0.0, 0.0), (0.2, 0.1, 2.4)), ((0.1, -0.15, 2.0), (-1.3, 0.4, 2.2))]
@@ -65,42 +64,30 @@ def cliffs() -> terrains.Terrain:
     return dataclasses.replace(reef, height_m=(0.2 * reef.height_m + 0.7 * plateau + rough).astype(np.float32))
 
 
-def world_of(terrain: terrains.Terrain) -> SceneModel:
-    return build(terrain, 0.01)
-
-
-def ray_reaches(world: SceneModel, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
+def ray_reaches(model: MjModel, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Returns whether the MuJoCo ray from a lamp reaches each of the points (n, 3)."""
-    data = mujoco.MjData(world.model)
-    data.qpos[2] = 100.0  # moves the vehicle out of the rays
-    mujoco.mj_forward(world.model, data)
-    geom, group, result = np.zeros(1, np.int32), np.zeros(6, np.uint8), []
-    group[FLOOR_GROUP] = 1
-    for point in points:
-        reach = np.linalg.norm(point - lamp)
-        hit = mujoco.mj_ray(world.model, data, lamp, (point - lamp) / reach, group, 1, -1, geom, None)
-        result.append(hit < 0 or hit > reach - 2e-4)
-    return np.array(result)
+    reach = np.linalg.norm(points - lamp, axis=1)
+    return ray_lengths(model, lamp, (points - lamp) / reach[:, None]) > reach - 2e-4
 
 
 def test_shadows_agree_with_mujoco_rays() -> None:
     """At 99.5 % or more of the pixels of both cameras, on a reef that is steep enough for shadows."""
     terrain = cliffs()
-    world, rng = world_of(terrain), np.random.default_rng(0)
+    model, rng = floor_model(terrain), np.random.default_rng(0)
     casting = Shadows(terrain, RIG, [lamps_in(0), lamps_in(1)])
     agree, dark = [], []
-    with Renderer(world, RIG.width_px, RIG.height_px, VFOV) as renderer:
-        for pose in POSES:
-            for camera in (0, 1):
-                world_from_camera = pose @ RIG.left_from_right if camera else pose
-                _, depth = renderer.render(world_from_camera)
-                lit = casting.lit(depth, world_from_camera, camera)
-                v, u = rng.integers(0, RIG.height_px, 3000), rng.integers(0, RIG.width_px, 3000)
-                points = points_of(depth, world_from_camera)[v, u]
-                for k, lamp in enumerate(geometry.transform(world_from_camera, lamps_in(camera))):
-                    expected = ray_reaches(world, lamp, points)
-                    agree.append(np.mean(lit[k, v, u] == expected))
-                    dark.append(1 - expected.mean())
+    renderer = Renderer(terrain, RIG.width_px, RIG.height_px, RIG.focal_px)
+    for pose in POSES:
+        for camera in (0, 1):
+            world_from_camera = pose @ RIG.left_from_right if camera else pose
+            _, depth = renderer.render(world_from_camera)
+            lit = casting.lit(depth, world_from_camera, camera)
+            v, u = rng.integers(0, RIG.height_px, 3000), rng.integers(0, RIG.width_px, 3000)
+            points = points_of(depth, world_from_camera)[v, u]
+            for k, lamp in enumerate(geometry.transform(world_from_camera, lamps_in(camera))):
+                expected = ray_reaches(model, lamp, points)
+                agree.append(np.mean(lit[k, v, u] == expected))
+                dark.append(1 - expected.mean())
     assert np.min(agree) >= 0.995
     assert np.mean(dark) > 0.03, "the test floor has too few shadows"
 

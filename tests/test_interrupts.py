@@ -14,7 +14,6 @@ import pytest
 import twin.session.conclusion
 import twin.session.flown_survey
 from twin import cli, survey
-from twin.app import doctor
 from twin.app.termination import sigterm_as_interrupt
 from twin.core.interrupts import StageGuard
 from twin.core.timing import Stopwatch
@@ -168,7 +167,6 @@ def test_the_reason_of_an_abort_comes_before_the_skipped_stages(tmp_path, monkey
 @pytest.fixture
 def command(monkeypatch, tmp_path):
     """Runs `twin run` on the small survey and returns its exit status."""
-    monkeypatch.setattr(doctor, "check_rendering", lambda: doctor.Check("OpenGL", True, "a renderer"))
     for stage in ("report", "recording"):
         monkeypatch.setattr(*STAGES[stage], lambda *_: None)
 

@@ -123,7 +123,6 @@ def render(
     """Render stereo images and truth along a path, at the frame rate of the rig, for `twin export`."""
     from twin.exports.rendered_path import render_path
 
-    _require_rendering()
     scenario = api.load_scenario(scene, overrides, allow_plugins)
     folder = outputs.run_folder(scenario) if out is None else outputs.new_folder(out)
     with console.replay_bar() as progress:
@@ -354,8 +353,6 @@ def _add_study_command(name: str, text: str, verify_text: str) -> None:
     ) -> None:
         from twin.app import study_command
 
-        if not scheduler:
-            _require_rendering()
         options = study_command.StudyOptions(
             out, jobs, scheduler, resume, live, verify, render_refused, budget, extrapolate, allow_plugins
         )
@@ -557,13 +554,13 @@ def export(
 
 @app.command()
 def doctor() -> None:
-    """Check rendering, packages and disk, and print how to fix a failure."""
+    """Check packages, disk and OpenGL, and print how to fix a failure."""
     from twin.app.doctor import check_machine
 
     checks = check_machine(Path.cwd())
     for check in checks:
         print(check)
-    raise typer.Exit(0 if all(check.ok for check in checks) else 2)
+    raise typer.Exit(0 if all(check.ok or check.optional for check in checks) else 2)
 
 
 @app.command()
@@ -586,8 +583,7 @@ def _run_survey(
     scene: str, overrides: list[str], out: Path | None, live: bool, allow_plugins: bool = False
 ) -> "RunResult":
     scenario = api.load_scenario(scene, overrides, allow_plugins)
-    _require_rendering()
-    from twin import survey  # imported here because it needs OpenGL
+    from twin import survey  # imported here because it takes half a second
 
     # last, because two surveys that begin at once must find different folders
     folder = outputs.run_folder(scenario) if out is None else outputs.new_folder(out)
@@ -615,17 +611,7 @@ def _show(as_json: bool, tree: Any, tables: Iterable[tuple[str, list[tuple[str, 
 
 @contextmanager
 def _results_folder(out: Path, file: str) -> Iterator[None]:
-    """Locks a folder while results are written to it; checks the path of their main file and the rendering before."""
+    """Locks a folder while results are written to it; checks the path of their main file before."""
     outputs.output_file(out / file)
-    _require_rendering()
     with sole_writer(out, used=True), outputs.writing(out):
         yield
-
-
-def _require_rendering() -> None:
-    from twin.app.doctor import check_rendering
-
-    check = check_rendering()
-    if not check.ok:
-        console.print_error(str(check))
-        raise typer.Exit(2)

@@ -157,7 +157,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return np.concatenate([self._frame.left, self._right()], axis=1)
 
     def close(self) -> None:
-        """Ends the episode: closes the estimators and releases the OpenGL context."""
+        """Ends the episode: closes the estimators."""
         self._world.close()
 
     def _command(self, values: Array) -> Array:

@@ -1,7 +1,7 @@
 """Vectorized arithmetic of the compiled loops: powers of two, and weighted sums of neighbouring colours.
 
 The compiler does not vectorize across the bands of a colour; these intrinsics emit the vector operations themselves,
-for 4 x 4 pixels of an image, and for entries of a table of R, G, B and a zero.
+for 4 x 4 pixels of an image, for 2 x 2 texels of a texture, and for entries of a table of R, G, B and a zero.
 """
 
 from __future__ import annotations
@@ -72,6 +72,37 @@ def sum_of_pixels(typingctx, image, start, stride, weights, at):
         return context.make_tuple(builder, result, _bands(builder, total))
 
     return signature, emit
+
+
+@intrinsic
+def sum_of_texels(typingctx, texels, start, stride, weights):
+    """Returns the weighted sums (R, G, B) of 2 x 2 texels of uint8 colours (3 n,); no bounds are checked.
+
+    `start` is the index of the first value, `stride` that from row to row; the tuple `weights` runs row by row.
+    """
+    result, pair = types.UniTuple(types.float32, _BANDS), ir.VectorType(_NUMBER, 2 * _BANDS)
+
+    def emit(context, builder, sig, args):
+        values = context.make_array(sig.args[0])(context, builder, args[0]).data
+        shares, total = cgutils.unpack_tuple(builder, args[3]), None
+        spread = ir.Constant(ir.VectorType(_INDEX, 2 * _BANDS), [k // _BANDS for k in range(2 * _BANDS)])
+        for row in range(2):
+            place = builder.add(args[1], args[2]) if row else args[1]
+            bytes_ = ir.VectorType(ir.IntType(8), 2 * _BANDS)
+            loaded = builder.load(builder.bitcast(builder.gep(values, [place]), bytes_.as_pointer()))
+            loaded.align = 1
+            numbers = builder.uitofp(builder.zext(loaded, ir.VectorType(_INDEX, 2 * _BANDS)), pair)
+            both = ir.Constant(ir.VectorType(_NUMBER, 2), ir.Undefined)
+            for k in range(2):
+                both = builder.insert_element(both, shares[2 * row + k], _INDEX(k))
+            total = _add(builder, total, numbers, builder.shuffle_vector(both, both, spread))
+        left, right = (
+            builder.shuffle_vector(total, total, ir.Constant(ir.VectorType(_INDEX, _BANDS), bands))
+            for bands in (list(range(_BANDS)), list(range(_BANDS, 2 * _BANDS)))
+        )
+        return context.make_tuple(builder, result, _bands(builder, builder.fadd(left, right)))
+
+    return result(texels, types.int64, types.int64, types.UniTuple(types.float32, 4)), emit
 
 
 @intrinsic

@@ -1,7 +1,7 @@
 """Worker processes that run one task at a time, and a thread-safe pool of them.
 
-A survey renders with OpenGL and runs compiled code, which can crash its process or hang without a way to interrupt it.
-Each task therefore runs in a worker process that can be killed and replaced.
+A survey runs compiled code, which can crash its process or hang without a way to interrupt it. Each task therefore runs
+in a worker process that can be killed and replaced.
 """
 
 from __future__ import annotations

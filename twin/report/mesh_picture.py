@@ -1,7 +1,7 @@
 """Oblique picture of the mapped surface: mesh.glb rendered with pyrender in a separate process.
 
-Closing pyrender's OpenGL display also closes MuJoCo's, and a faulty driver can crash the process. Therefore
-`surface_picture` runs this module as a program and returns None if the program fails.
+A faulty OpenGL driver can crash the process. Therefore `surface_picture` runs this module as a program and returns None
+if the program fails.
 """
 
 from __future__ import annotations

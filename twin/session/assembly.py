@@ -17,8 +17,8 @@ from twin.world.world import World
 
 
 def open_world(mission: Mission, stopwatch: StageTimer) -> World:
-    """Returns the world of a mission; raises TwinError if OpenGL or the error model is missing or cannot be used."""
-    # imported here: MuJoCo and OpenGL take 25 MB that a surrogate survey does not need
+    """Returns the world of a mission; raises TwinError if the error model is missing or cannot be used."""
+    # imported here: MuJoCo takes 20 MB that a surrogate survey does not need
     if mission.scenario.imaging.fidelity == "rendered":
         from twin.world.rendered_world import RenderedWorld
 

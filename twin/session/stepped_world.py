@@ -38,8 +38,8 @@ class SteppedWorld:
 
     `reset` starts the survey and returns its first frame; `step` moves the vehicle by one frame interval and returns
     the next frame of the plan. A frame holds images and sensor readings, no truth. The same seed and the same commands
-    give the same frames, bit for bit. One object holds one OpenGL context; use it in one thread. Before `reset`, all
-    methods and properties that need a flight raise RuntimeError. Raises ScenarioError if the survey cannot be flown.
+    give the same frames, bit for bit. Use one object in one thread. Before `reset`, all methods
+    and properties that need a flight raise RuntimeError. Raises ScenarioError if the survey cannot be flown.
     """
 
     def __init__(self, scenario: Scenario):
@@ -56,7 +56,7 @@ class SteppedWorld:
         self.close()
 
     def close(self) -> None:
-        """Ends the flight: closes its estimators and releases the OpenGL context; `reset` can start another flight."""
+        """Ends the flight: closes its estimators; `reset` can start another flight."""
         self._flight = self._estimators = None
         self._open.close()
 

@@ -29,17 +29,15 @@ from twin.world.world import CameraImages, World, streams
 
 
 class RenderedWorld(World):
-    """World with images: MuJoCo renders albedo and depth, `twin.imaging` adds light and water; `close` frees OpenGL."""
+    """World with images of the floor and objects, in the light of lamps and daylight, through water."""
 
     def __init__(self, mission: Mission, stopwatch: StageTimer):
         scenario, cameras = mission.scenario, mission.true_cameras
         rig, rng = cameras.rendered_rig, streams(scenario.seed)
-        vfov_deg = float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px)))
-        body = scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2
-        scene = build(mission.rendered_terrain, physics_timestep_s(rig.frame_rate_hz, scenario.vehicle), *body)
+        timestep_s = physics_timestep_s(rig.frame_rate_hz, scenario.vehicle)
         vehicle = (
             MujocoVehicle(
-                scene.model,
+                build(timestep_s, scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2),
                 scenario.vehicle,
                 make_sea(scenario, rng["sea"]),
                 mission.start_of_body,
@@ -57,8 +55,8 @@ class RenderedWorld(World):
             vehicle.after_timestep = imu.add
         sensors = NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project, imu)
         super().__init__(mission, stopwatch, vehicle, sensors)
-        self.renderer = Renderer(scene, rig.width_px, rig.height_px, vfov_deg)
         floor, objects = mission.rendered_terrain, mission.rendered_objects()
+        self.renderer = Renderer(floor, rig.width_px, rig.height_px, rig.focal_px)
         self._image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
         noise_rngs = rng["left_camera"], rng["right_camera"]
         self.camera = StereoCamera(self.renderer, self._image_formation, scenario, *noise_rngs, stopwatch, cameras)
@@ -71,7 +69,7 @@ class RenderedWorld(World):
         return with_objects(floor, objects) if objects else floor
 
     def close(self) -> None:
-        self.renderer.close()
+        """Has no effect: the world holds no resources."""
 
     def capture(self, step: Step) -> CameraImages:
         if self.faults.exist:

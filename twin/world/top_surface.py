@@ -132,8 +132,7 @@ def true_albedo(terrain: Terrain, grid: MapGrid) -> NDArray[np.float32]:
             part = out[top : top + side, left : left + side]
             of_cols, of_rows = slice(left * n, (left + side) * n), slice(top * n, (top + side) * n)
             fine = _samples(terrain.texture, *np.meshgrid(col[of_cols], row[of_rows]))
-            if walls is not None:
-                paint_walls_from_above(walls, fine, x[of_cols], y[of_rows], step_m)
+            paint_walls_from_above(terrain, walls, fine, x[of_cols], y[of_rows], step_m)
             part[:] = fine.reshape(len(part), n, -1, n, 3).mean(axis=(1, 3), dtype=np.float32)
     inside_x = (x[n // 2 :: n] >= terrain.west_m) & (x[n // 2 :: n] <= terrain.east_m)
     inside_y = (y[n // 2 :: n] >= terrain.south_m) & (y[n // 2 :: n] <= terrain.north_m)

@@ -1,6 +1,6 @@
 """Facets of the floor: the normals of the triangles of its height grid, for the shading of the pixels that show them.
 
-The depth of a pixel gives a point in one of the two triangles of a cell, those that are rendered (`scenes.builder`).
+The depth of a pixel gives a point in one of the two triangles of a cell, those that are rendered (`floor_raster`).
 A normal, which points up, is stored in 32 bits as (nx, ny) / (1 + nz), 16 bits each; its error is below 0.004 deg.
 """
 
