@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import replace
+from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from twin.core.checkpoint import Checkpoints
 from twin.core.interrupts import StageGuard
 from twin.core.output_folder import sole_writer
 from twin.core.quality import Gaps
 from twin.core.records import Estimate, Frame
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
-from twin.errors import SurveyAborted
+from twin.core.user_files import is_file
+from twin.errors import SurveyAborted, TwinError
 from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
 from twin.report.run_result import RunResult
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.model import Scenario
-from twin.session.assembly import Estimators, make_navigator, open_world
+from twin.session.assembly import Estimators, checkpoints_of, make_navigator, open_world, reopened
 from twin.session.conclusion import Estimation, conclude
 from twin.session.flown_survey import FlownSurvey
 from twin.session.mission_actions import MissionActions
@@ -26,8 +29,32 @@ from twin.session.path_adaptation import PathAdaptation
 from twin.world.mission import Mission, prepare
 from twin.world.mission_flight import Flight
 from twin.world.pace import FULL
-from twin.world.pilot import make_pilot, without_feedback
+from twin.world.pilot import PilotOfEstimates, make_pilot, without_feedback
 from twin.world.world import World
+
+
+@dataclass
+class _Loop:
+    """What the closed loop carries from one frame to the next."""
+
+    flight: Flight
+    pilot: PilotOfEstimates
+    adapt: PathAdaptation
+    frame: Frame | None
+
+
+@dataclass
+class _Survey:
+    """A survey between two frames or, without a loop, after the last one."""
+
+    world: World
+    folder: RunFolder
+    monitor: SurveyMonitor
+    navigator: Estimators
+    recorder: FrameRecorder | None
+    loop: _Loop | None = None
+    cause: str = ""  #: why the flight was aborted, "" if it was not
+    gaps: Gaps = Gaps()
 
 
 def run(
@@ -36,6 +63,8 @@ def run(
     progress: Callable[[SurveyProgress], None] = lambda _: None,
     live: bool = False,
     outputs: Collection[str] | None = OPTIONAL_OUTPUTS,
+    resume: bool = False,
+    checkpoint_s: float | None = 0.0,
 ) -> RunResult:
     """Runs the survey of a scenario and writes a run folder, with the partial results if the survey is aborted.
 
@@ -49,9 +78,22 @@ def run(
         live: whether to show the survey in Rerun while it runs.
         outputs: outputs to write in addition to metrics, trajectories and maps: "report", "recording", both or none of
             them. None: write the metrics only.
+        resume: whether to continue the survey in the folder from its last checkpoint; it ends as if it had not been
+            killed, except times. Without a checkpoint in an otherwise empty folder, the survey begins.
+        checkpoint_s: wall time between checkpoints [s]; 0: none; None: 60, or so much that they take 1 % of the time.
     """
-    with sole_writer(out), one_blas_thread():
-        return _run(prepare(scenario), out, progress, live, outputs)
+    with sole_writer(out, used=resume), one_blas_thread():
+        checkpoints = checkpoints_of(scenario, out, checkpoint_s)
+        if resume and is_file(out / "metrics.json"):  # killed after its end
+            result = RunResult.of_folder(out)
+            if result.metrics["scenario_hash"] != scenario.fingerprint():
+                raise TwinError("--resume", f"{out} has another survey, which is finished", "the folder of this survey")
+        else:
+            result = _run(prepare(scenario), out, progress, live, outputs, checkpoints, resume)
+        checkpoints.remove()
+        if scenario.record == "none":
+            remove_keyframe_images(out)
+    return result
 
 
 def _run(
@@ -60,39 +102,87 @@ def _run(
     progress: Callable[[SurveyProgress], None],
     live: bool,
     outputs: Collection[str] | None,
+    checkpoints: Checkpoints,
+    resume: bool,
 ) -> RunResult:
-    scenario, stopwatch, guard = mission.scenario, Stopwatch(), StageGuard()
-    images = scenario.imaging.fidelity == "rendered" and outputs is not None
-    with guard, open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
-        _log_warnings(mission, world, folder)
-        monitor = SurveyMonitor(mission, folder, progress, live)
-        gaps = Gaps()
-        with make_navigator(mission, world, out, stopwatch) as navigator:
-            try:
-                with guard.stage(), FrameRecorder(out, scenario.record if images else "none") as recorder:
+    scenario, guard = mission.scenario, StageGuard()
+    with guard, ExitStack() as opened:
+        fresh = opened.enter_context(open_world(mission, Stopwatch()))
+        made_anew = (*fresh.made_anew, progress)
+        survey: _Survey | None = checkpoints.load(made_anew) if resume else None
+        if survey is None:
+            checkpoints.begin()
+            survey = _begin(mission, fresh, out, progress, outputs, opened)
+        else:
+            opened.enter_context(survey.folder)
+            opened.enter_context(reopened(survey.navigator))
+        if live:
+            survey.monitor.show_live(mission)
+        if survey.recorder is not None:
+            _fly_recorded(mission, survey, guard, checkpoints, made_anew)
+        guard.cause = survey.cause
+        world, folder, monitor = survey.world, survey.folder, survey.monitor
+        for event in world.faults.events:
+            folder.log("fault", **event.described)
+        for thruster in world.thruster_monitor.lost:
+            folder.log("thruster left out", **thruster._asdict())
+        warnings = (*world.warnings, *world.faults.sentences, *world.thruster_monitor.sentences)
+        actions = monitor.actions.times
+        flown = FlownSurvey(mission, world.truth(), warnings, actions, survey.gaps, world.detail_truth)
+        timed = survey.navigator, world.stopwatch
+        estimation = Estimation(*timed, guard, folder, monitor.report_stage, monitor.start_s)
+        return conclude(estimation, flown)[0]
 
-                    def observe(estimate: Estimate, frame: Frame) -> None:
-                        taken = replace(frame, readings=world.measured)
-                        if scenario.record == "all" and frame.right is None:
-                            taken = replace(taken, right=world.right_image())
-                        recorder.add(taken, world.world_from_camera, world.vehicle.twist_body)
-                        monitor(estimate, frame)
 
-                    gaps = fly(mission, world, navigator, observe, monitor.actions)
-            except (SurveyAborted, OSError, KeyboardInterrupt) as error:
-                guard.cause = str(error) or "interrupted"
-            for event in world.faults.events:
-                folder.log("fault", **event.described)
-            for thruster in world.thruster_monitor.lost:
-                folder.log("thruster left out", **thruster._asdict())
-            warnings = (*world.warnings, *world.faults.sentences, *world.thruster_monitor.sentences)
-            actions = monitor.actions.times
-            flown = FlownSurvey(mission, world.truth(), warnings, actions, gaps, world.detail_truth)
-            estimation = Estimation(navigator, stopwatch, guard, folder, monitor.report_stage, monitor.start_s)
-            result, _ = conclude(estimation, flown)
-    if scenario.record == "none" and images:
-        remove_keyframe_images(out)
-    return result
+def _begin(
+    mission: Mission,
+    world: World,
+    out: Path,
+    progress: Callable[[SurveyProgress], None],
+    outputs: Collection[str] | None,
+    opened: ExitStack,
+) -> _Survey:
+    """Returns a survey before its first frame; its files are closed by `opened`."""
+    folder = opened.enter_context(RunFolder(out, mission.scenario, outputs))
+    _log_warnings(mission, world, folder)
+    monitor = SurveyMonitor(mission, folder, progress)
+    navigator = opened.enter_context(make_navigator(mission, world, out, world.stopwatch))
+    images = mission.scenario.imaging.fidelity == "rendered" and outputs is not None
+    recorder = FrameRecorder(out, mission.scenario.record if images else "none")
+    return _Survey(world, folder, monitor, navigator, recorder)
+
+
+def _fly_recorded(
+    mission: Mission, survey: _Survey, guard: StageGuard, checkpoints: Checkpoints, made_anew: Sequence[object]
+) -> None:
+    """Flies a survey from where it is to its end, with checkpoints; `survey.cause` says why it ended early."""
+    world, recorder = survey.world, survey.recorder
+    assert recorder is not None
+
+    def observe(estimate: Estimate, frame: Frame) -> None:
+        taken = replace(frame, readings=world.measured)
+        if mission.scenario.record == "all" and frame.right is None:
+            taken = replace(taken, right=world.right_image())
+        recorder.add(taken, world.world_from_camera, world.vehicle.twist_body)
+        survey.monitor(estimate, frame)
+
+    def save_if_due(loop: _Loop) -> None:
+        if checkpoints.due:
+            survey.loop = loop
+            checkpoints.save(survey, made_anew)
+
+    lost = False
+    try:
+        with guard.stage(), recorder:
+            actions = survey.monitor.actions
+            survey.gaps = fly(mission, world, survey.navigator, observe, actions, survey.loop, save_if_due)
+    except (SurveyAborted, OSError, KeyboardInterrupt) as error:
+        survey.cause, lost = str(error) or "interrupted", not isinstance(error, SurveyAborted)
+    survey.loop = survey.recorder = None
+    if checkpoints.last_due and not lost:
+        checkpoints.save(survey, made_anew)
+    if checkpoints.problem:
+        survey.folder.log("no checkpoint", reason=checkpoints.problem)
 
 
 def _log_warnings(mission: Mission, world: World, folder: RunFolder) -> None:
@@ -108,6 +198,8 @@ def fly(
     navigator: Estimators,
     observe: Callable[[Estimate, Frame], None],
     actions: MissionActions | None = None,
+    resumed: _Loop | None = None,
+    between_frames: Callable[[_Loop], None] = lambda _: None,
 ) -> Gaps:
     """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the vehicle.
 
@@ -119,25 +211,31 @@ def fly(
             between keyframes that the compiled loop of a surrogate survey simulates.
         actions: chooses the pace along the path: the vehicle slows down or stops if tracking is poor or lost, until
             tracking recovers; None: the vehicle always flies at the planned speed.
+        resumed: the loop of a checkpoint, which goes on; None: the survey begins.
+        between_frames: called before every frame; it may save a checkpoint.
 
     Raises:
         SurveyAborted: the physics diverged, an alignment or a plug-in failed, or `observe` aborted the survey.
         OSError: images could not be read or written.
     """
-    pilot = make_pilot(mission, world.thruster_monitor)
-    scenario = mission.scenario
+    loop, scenario = resumed or _take_off(mission, world), mission.scenario
+    flight, pilot, adapt = loop.flight, loop.pilot, loop.adapt
     by_frame = scenario.control.height == "altimeter" or scenario.navigation.needs_every_frame
-    flight = Flight(mission, world, None if by_frame else world.fast_forward(navigator, pilot))
-    adapt = PathAdaptation(flight, pilot)
-    frame = flight.start()
-    while frame is not None:
+    flight.fast_forward = None if by_frame else world.fast_forward(navigator, pilot)
+    while (frame := loop.frame) is not None:
+        between_frames(loop)
         if flight.aligns:
             navigator.align_track(flight.track)
         estimate = navigator.update(frame, flight.track)
         observe(estimate, frame)
         command = pilot(without_feedback(estimate, flight.reference, frame.readings), flight.reference)
         adapt(frame, estimate, navigator)
-        frame = flight.step(command, FULL if actions is None else actions(estimate, bool(frame.keyframe)))
+        loop.frame = flight.step(command, FULL if actions is None else actions(estimate, bool(frame.keyframe)))
         if actions is not None:
             actions.add_measured_frames(flight.n_skipped)
     return adapt.gaps
+
+
+def _take_off(mission: Mission, world: World) -> _Loop:
+    pilot, flight = make_pilot(mission, world.thruster_monitor), Flight(mission, world)
+    return _Loop(flight, pilot, PathAdaptation(flight, pilot), flight.start())

@@ -5,12 +5,15 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.checkpoint import check_hash
 from twin.core.records import Image
 from twin.estimate.vision import matching
 
@@ -29,11 +32,25 @@ class ImageSpool:
 
     def __init__(self, folder: Path, binning: int = 1):
         self.folder, self.binning = folder, binning
+        self._hashes: dict[Path, str] = {}  # of the files written so far
         folder.mkdir(parents=True, exist_ok=True)
+        self._start()
+
+    def _start(self) -> None:
         self._writer = ThreadPoolExecutor(1)  # compresses in the background
         self._lock = threading.Lock()  # links are measured in other threads
         self._writing: Future[None] | None = None
         self._gray: OrderedDict[int, tuple[NDArray[np.float16], NDArray[np.float16]]] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.flush()
+        return {"folder": self.folder, "binning": self.binning, "_hashes": self._hashes}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        for file, expected in self._hashes.items():
+            check_hash(file, expected)
+        self._start()
 
     def put(self, row: int, left: Image, right: Image, gray: tuple[matching.Gray, matching.Gray]) -> None:
         """Stores the full stereo pair of a keyframe, which another thread writes, and its binned grey levels."""
@@ -79,6 +96,7 @@ class ImageSpool:
         for side, image in (("left", left), ("right", right)):
             data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
             self._path(row, side).write_bytes(data.tobytes())
+            self._hashes[self._path(row, side)] = sha256(data).hexdigest()
 
     def _path(self, row: int, side: str) -> Path:
         return self.folder / f"{row:06d}_{side}.png"
