@@ -51,7 +51,8 @@ class _Survey:
     folder: RunFolder
     monitor: SurveyMonitor
     navigator: Estimators
-    recorder: FrameRecorder | None
+    stopwatch: Stopwatch
+    recorder: FrameRecorder | None  #: None after the last frame
     loop: _Loop | None = None
     cause: str = ""  #: why the flight was aborted, "" if it was not
     gaps: Gaps = Gaps()
@@ -91,7 +92,7 @@ def run(
         else:
             result = _run(prepare(scenario), out, progress, live, outputs, checkpoints, resume)
         checkpoints.remove()
-        if scenario.record == "none":
+        if scenario.record == "none" and outputs is not None:
             remove_keyframe_images(out)
     return result
 
@@ -105,14 +106,14 @@ def _run(
     checkpoints: Checkpoints,
     resume: bool,
 ) -> RunResult:
-    scenario, guard = mission.scenario, StageGuard()
+    guard, stopwatch = StageGuard(), Stopwatch()
     with guard, ExitStack() as opened:
-        fresh = opened.enter_context(open_world(mission, Stopwatch()))
+        fresh = opened.enter_context(open_world(mission, stopwatch))
         made_anew = (*fresh.made_anew, progress)
         survey: _Survey | None = checkpoints.load(made_anew) if resume else None
         if survey is None:
             checkpoints.begin()
-            survey = _begin(mission, fresh, out, progress, outputs, opened)
+            survey = _begin(mission, fresh, out, progress, outputs, stopwatch, opened)
         else:
             opened.enter_context(survey.folder)
             opened.enter_context(reopened(survey.navigator))
@@ -129,7 +130,7 @@ def _run(
         warnings = (*world.warnings, *world.faults.sentences, *world.thruster_monitor.sentences)
         actions = monitor.actions.times
         flown = FlownSurvey(mission, world.truth(), warnings, actions, survey.gaps, world.detail_truth)
-        timed = survey.navigator, world.stopwatch
+        timed = survey.navigator, survey.stopwatch
         estimation = Estimation(*timed, guard, folder, monitor.report_stage, monitor.start_s)
         return conclude(estimation, flown)[0]
 
@@ -140,16 +141,17 @@ def _begin(
     out: Path,
     progress: Callable[[SurveyProgress], None],
     outputs: Collection[str] | None,
+    stopwatch: Stopwatch,
     opened: ExitStack,
 ) -> _Survey:
     """Returns a survey before its first frame; its files are closed by `opened`."""
     folder = opened.enter_context(RunFolder(out, mission.scenario, outputs))
     _log_warnings(mission, world, folder)
     monitor = SurveyMonitor(mission, folder, progress)
-    navigator = opened.enter_context(make_navigator(mission, world, out, world.stopwatch))
+    navigator = opened.enter_context(make_navigator(mission, world, out, stopwatch))
     images = mission.scenario.imaging.fidelity == "rendered" and outputs is not None
     recorder = FrameRecorder(out, mission.scenario.record if images else "none")
-    return _Survey(world, folder, monitor, navigator, recorder)
+    return _Survey(world, folder, monitor, navigator, stopwatch, recorder)
 
 
 def _fly_recorded(

@@ -43,6 +43,8 @@ class Checkpoints:
     def __init__(
         self, run: Path, identity: Mapping[str, str], inputs: Iterable[Path] = (), interval_s: float | None = None
     ):
+        if interval_s is not None and not interval_s >= 0:
+            raise TwinError("checkpoint_s", f"{interval_s} s is no time between checkpoints", "0 or more")
         self._run, self._folder, self._manifest = run, run / FOLDER, run / FOLDER / "manifest.json"
         self._contents: dict[str, Any] = {"schema": SCHEMA, "identity": dict(identity), "state": None}
         self._inputs = sorted(set(inputs))

@@ -89,7 +89,9 @@ class KeyframeNetwork:
         """Returns the state after all pending links have been measured in the separate thread."""
         pending = self._pending
         if self._executor is not None:
-            pending = deque((partial(list, measure()), *rest) for measure, *rest in pending)
+            pending = deque(
+                (partial(list[LinkAttempt], measure()), chain, bridge) for measure, chain, bridge in pending
+            )
         return vars(self) | {"_executor": None, "_pending": pending}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

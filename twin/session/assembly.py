@@ -12,8 +12,8 @@ from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision_interface import Vision
-from twin.plugin.navigator import Estimators, navigator_of
 from twin.kernels import source_hash
+from twin.plugin.navigator import Estimators, navigator_of
 from twin.plugin.protocols import EstimatorSetup
 from twin.report.run_writer import environment
 from twin.scenario.file import input_files
@@ -26,8 +26,8 @@ _OF_THE_MACHINE = ("machine", "system", "cpus")  # of env.json: other machines m
 
 def checkpoints_of(scenario: Scenario, out: Path, interval_s: float | None) -> Checkpoints:
     """Returns the checkpoints of a survey, which belong to its scenario, its input files and this program."""
-    identity = {"scenario": scenario.fingerprint(), "record": scenario.record}
-    return Checkpoints(out, identity | program(), input_files(scenario), interval_s)
+    identity = {"scenario": scenario.fingerprint(), "record": scenario.record} | program()
+    return Checkpoints(out, identity, input_files(scenario), interval_s)
 
 
 @cache

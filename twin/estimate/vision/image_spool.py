@@ -94,8 +94,8 @@ class ImageSpool:
 
     def _write(self, row: int, left: Image, right: Image) -> None:
         for side, image in (("left", left), ("right", right)):
-            data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-            self._path(row, side).write_bytes(data.tobytes())
+            data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+            self._path(row, side).write_bytes(data)
             self._hashes[self._path(row, side)] = sha256(data).hexdigest()
 
     def _path(self, row: int, side: str) -> Path:
