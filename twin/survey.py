@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,11 +16,11 @@ from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
 from twin.core.user_files import is_file
 from twin.errors import SurveyAborted, TwinError
-from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
+from twin.report.frame_recorder import FrameRecorder, Record, remove_keyframe_images
 from twin.report.run_result import RunResult
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.model import Scenario
-from twin.session.assembly import Estimators, checkpoints_of, make_navigator, open_world, reopened
+from twin.session.assembly import Estimators, checkpoints_of, closing, make_navigator, open_world
 from twin.session.conclusion import Estimation, conclude
 from twin.session.flown_survey import FlownSurvey
 from twin.session.mission_actions import MissionActions
@@ -45,15 +45,16 @@ class _Loop:
 
 @dataclass
 class _Survey:
-    """A survey between two frames or, without a loop, after the last one."""
+    """A survey between two frames, or after the last one."""
 
     world: World
     folder: RunFolder
     monitor: SurveyMonitor
     navigator: Estimators
     stopwatch: Stopwatch
-    recorder: FrameRecorder | None  #: None after the last frame
+    recorder: FrameRecorder | None = None
     loop: _Loop | None = None
+    flown: bool = False  #: whether the last frame has been flown
     cause: str = ""  #: why the flight was aborted, "" if it was not
     gaps: Gaps = Gaps()
 
@@ -98,31 +99,29 @@ def run(
 
 
 def _run(
-    mission: Mission,
-    out: Path,
-    progress: Callable[[SurveyProgress], None],
-    live: bool,
-    outputs: Collection[str] | None,
-    checkpoints: Checkpoints,
-    resume: bool,
-) -> RunResult:
+    mission: Mission, out: Path, progress: Callable[[SurveyProgress], None], live: bool,
+    outputs: Collection[str] | None, checkpoints: Checkpoints, resume: bool,
+) -> RunResult:  # fmt: skip
     guard, stopwatch = StageGuard(), Stopwatch()
     with guard, ExitStack() as opened:
         fresh = opened.enter_context(open_world(mission, stopwatch))
-        made_anew = (*fresh.made_anew, progress)
-        survey: _Survey | None = checkpoints.load(made_anew) if resume else None
+        survey: _Survey | None = checkpoints.open(resume, (*fresh.made_anew, progress))
         if survey is None:
-            checkpoints.begin()
-            survey = _begin(mission, fresh, out, progress, outputs, stopwatch, opened)
+            folder = opened.enter_context(RunFolder(out, mission.scenario, outputs))
+            _log_warnings(mission, fresh, folder)
+            monitor = SurveyMonitor(mission, folder, progress)
+            navigator = opened.enter_context(make_navigator(mission, fresh, out, stopwatch))
+            survey = _Survey(fresh, folder, monitor, navigator, stopwatch)
         else:
             opened.enter_context(survey.folder)
-            opened.enter_context(reopened(survey.navigator))
-        if live:
-            survey.monitor.show_live(mission)
-        if survey.recorder is not None:
-            _fly_recorded(mission, survey, guard, checkpoints, made_anew)
-        guard.cause = survey.cause
+            opened.enter_context(closing(survey.navigator))
         world, folder, monitor = survey.world, survey.folder, survey.monitor
+        if live:
+            monitor.show_live(mission)
+        if not survey.flown:
+            images = mission.scenario.imaging.fidelity == "rendered" and outputs is not None
+            _fly_recorded(mission, survey, out, mission.scenario.record if images else "none", guard, checkpoints)
+        guard.cause = survey.cause
         for event in world.faults.events:
             folder.log("fault", **event.described)
         for thruster in world.thruster_monitor.lost:
@@ -135,54 +134,33 @@ def _run(
         return conclude(estimation, flown)[0]
 
 
-def _begin(
-    mission: Mission,
-    world: World,
-    out: Path,
-    progress: Callable[[SurveyProgress], None],
-    outputs: Collection[str] | None,
-    stopwatch: Stopwatch,
-    opened: ExitStack,
-) -> _Survey:
-    """Returns a survey before its first frame; its files are closed by `opened`."""
-    folder = opened.enter_context(RunFolder(out, mission.scenario, outputs))
-    _log_warnings(mission, world, folder)
-    monitor = SurveyMonitor(mission, folder, progress)
-    navigator = opened.enter_context(make_navigator(mission, world, out, stopwatch))
-    images = mission.scenario.imaging.fidelity == "rendered" and outputs is not None
-    recorder = FrameRecorder(out, mission.scenario.record if images else "none")
-    return _Survey(world, folder, monitor, navigator, stopwatch, recorder)
-
-
 def _fly_recorded(
-    mission: Mission, survey: _Survey, guard: StageGuard, checkpoints: Checkpoints, made_anew: Sequence[object]
+    mission: Mission, survey: _Survey, out: Path, record: Record, guard: StageGuard, checkpoints: Checkpoints
 ) -> None:
     """Flies a survey from where it is to its end, with checkpoints; `survey.cause` says why it ended early."""
-    world, recorder = survey.world, survey.recorder
-    assert recorder is not None
-
-    def observe(estimate: Estimate, frame: Frame) -> None:
-        taken = replace(frame, readings=world.measured)
-        if mission.scenario.record == "all" and frame.right is None:
-            taken = replace(taken, right=world.right_image())
-        recorder.add(taken, world.world_from_camera, world.vehicle.twist_body)
-        survey.monitor(estimate, frame)
+    world = survey.world
 
     def save_if_due(loop: _Loop) -> None:
-        if checkpoints.due:
-            survey.loop = loop
-            checkpoints.save(survey, made_anew)
+        survey.loop = loop
+        checkpoints.save_if_due(survey)
 
-    lost = False
     try:
-        with guard.stage(), recorder:
+        with guard.stage(), survey.recorder or FrameRecorder(out, record) as recorder:
+            survey.recorder = recorder
+
+            def observe(estimate: Estimate, frame: Frame) -> None:
+                taken = replace(frame, readings=world.measured)
+                if mission.scenario.record == "all" and frame.right is None:
+                    taken = replace(taken, right=world.right_image())
+                recorder.add(taken, world.world_from_camera, world.vehicle.twist_body)
+                survey.monitor(estimate, frame)
+
             actions = survey.monitor.actions
             survey.gaps = fly(mission, world, survey.navigator, observe, actions, survey.loop, save_if_due)
     except (SurveyAborted, OSError, KeyboardInterrupt) as error:
-        survey.cause, lost = str(error) or "interrupted", not isinstance(error, SurveyAborted)
-    survey.loop = survey.recorder = None
-    if checkpoints.last_due and not lost:
-        checkpoints.save(survey, made_anew)
+        survey.cause = str(error) or "interrupted"
+    survey.loop, survey.recorder, survey.flown = None, None, True
+    checkpoints.save_last(survey)
     if checkpoints.problem:
         survey.folder.log("no checkpoint", reason=checkpoints.problem)
 

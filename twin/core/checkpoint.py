@@ -40,112 +40,99 @@ class Checkpoints:
             1 % of the time.
     """
 
-    def __init__(
-        self, run: Path, identity: Mapping[str, str], inputs: Iterable[Path] = (), interval_s: float | None = None
-    ):
+    def __init__(self, run: Path, identity: Mapping[str, str], inputs: Iterable[Path], interval_s: float | None):
         if interval_s is not None and not interval_s >= 0:
             raise TwinError("checkpoint_s", f"{interval_s} s is no time between checkpoints", "0 or more")
         self._run, self._folder, self._manifest = run, run / FOLDER, run / FOLDER / "manifest.json"
         self._contents: dict[str, Any] = {"schema": SCHEMA, "identity": dict(identity), "state": None}
-        self._inputs = sorted(set(inputs))
+        self._inputs, self._made_anew = sorted(set(inputs)), ()
         self._is_default, self._interval_s = interval_s is None, DEFAULT_S if interval_s is None else interval_s
         self._start_s = self._last_s = time.perf_counter()
-        self._number = 0
         self.problem = ""  #: why the last state could not be saved
 
-    def begin(self) -> None:
-        """Creates the folder, with a manifest without a state, unless no checkpoints are to be saved."""
-        if not self._interval_s:
-            return
-        self._contents |= {"state": None, "inputs": self._hashes()}
-        with suppress(OSError):  # `save` will say why
+    def open(self, resume: bool, made_anew: Sequence[object] = ()) -> Any:
+        """Returns the last state if the run is to be resumed; None if it begins, or was killed before the first one.
+
+        Args:
+            made_anew: objects that a state leaves out; they are the same, in the same order, in every process.
+
+        Raises:
+            TwinError: manifest, state or a file on which the state depends was edited or is damaged, or they belong to
+                another run or program, or the folder has other contents and no checkpoint.
+        """
+        self._made_anew = made_anew
+        if not (resume or self._interval_s):
+            return None
+        self._contents["inputs"] = {str(file): file_hash(file) for file in self._inputs}
+        if resume and is_file(self._manifest):
+            state = self._checked_state()
+            if state is not None:
+                return self._loaded(state)
+        elif resume and {file.name for file in self._run.iterdir()} - {LOCK_FILE, FOLDER}:
+            raise TwinError("--resume", f"{self._run} has no checkpoint", "the folder of a run that was killed")
+        with suppress(OSError):  # `_save` will say why
             self._folder.mkdir(parents=True, exist_ok=True)
             self._write_manifest()
+        return None
 
-    def _hashes(self) -> dict[str, str]:
-        return {str(file): file_hash(file) for file in self._inputs}
-
-    def load(self, made_anew: Sequence[object]) -> Any:
-        """Returns the last state; None if the run was killed before the first one.
-
-        `made_anew` are the objects that replace those of `save`, in the same order. Raises TwinError if manifest, state
-        or a file on which the state depends was edited or is damaged, or they belong to another run or program, or the
-        folder of the run has other contents and no checkpoint.
-        """
-        if not is_file(self._manifest):
-            if {file.name for file in self._run.iterdir()} - {LOCK_FILE, FOLDER}:
-                raise TwinError("--resume", f"{self._run} has no checkpoint", "the folder of a run that was killed")
-            return None
-        self._contents["inputs"] = self._hashes()
-        found = read_json(self._manifest, allowed=_WHOLE)
+    def _checked_state(self) -> Any:
+        found, name = read_json(self._manifest, allowed=_WHOLE), str(self._manifest)
         if not isinstance(found, dict) or found.get("schema") != SCHEMA:
-            raise self._refused(self._manifest, f"has not the schema {SCHEMA}", _SAME)
+            raise TwinError(name, f"has not the schema {SCHEMA}", _SAME)
         for part, what in (("identity", "{}: was {}, is {}"), ("inputs", "the file {} has changed")):
             before, now = found.get(part), self._contents[part]
             if not isinstance(before, dict) or before.keys() != now.keys():
-                raise self._refused(self._manifest, f"has other {part}", _SAME)
-            for name in now:
-                if before[name] != now[name]:
-                    raise self._refused(self._manifest, what.format(name, before[name], now[name]), _SAME)
-        if (state := found.get("state")) is None:
-            return None
+                raise TwinError(name, f"has other {part}", _SAME)
+            for key in now:
+                if before[key] != now[key]:
+                    raise TwinError(name, what.format(key, before[key], now[key]), _SAME)
+        return found.get("state")
+
+    def _loaded(self, state: Any) -> Any:
         try:
-            file, self._number = self._folder / Path(state["file"]).name, int(state["number"])
+            file = self._folder / f"state-{int(state['number'])}.pickle"
             check_hash(file, state["sha256"])
         except (KeyError, TypeError, ValueError):
-            raise self._refused(self._manifest, "names no state", _WHOLE) from None
+            raise TwinError(str(self._manifest), "names no state", _WHOLE) from None
         self._contents["state"] = state
         with file.open("rb") as stream:
             try:
-                return _Reader(stream, self._run, made_anew).load()
+                return _Reader(stream, self._run, self._made_anew).load()
             except TwinError:
                 raise
             except Exception as error:  # code or packages that the identity does not tell apart
-                raise self._refused(file, f"cannot be read: {error}", _SAME) from error
+                raise TwinError(str(file), f"cannot be read: {error}", _SAME) from error
 
-    @staticmethod
-    def _refused(file: Path, problem: str, allowed: str) -> TwinError:
-        return TwinError(str(file), problem, allowed)
+    def save_if_due(self, state: object) -> None:
+        """Saves a state if the interval has passed since the last one."""
+        if self._interval_s and time.perf_counter() - self._last_s >= self._interval_s:
+            self._save(state)
 
-    @property
-    def due(self) -> bool:
-        return bool(self._interval_s) and time.perf_counter() - self._last_s >= self._interval_s
+    def save_last(self, state: object) -> None:
+        """Saves the state before the last stages of the run, unless it has taken less time than the interval so far."""
+        if self._interval_s and time.perf_counter() - self._start_s >= self._interval_s:
+            self._save(state)
 
-    @property
-    def last_due(self) -> bool:
-        """Returns whether the state after the last frame is to be saved: the run has taken longer than the interval."""
-        return bool(self._interval_s) and time.perf_counter() - self._start_s >= self._interval_s
-
-    def save(self, state: object, made_anew: Sequence[object]) -> None:
-        """Saves a state, without the objects `made_anew`, which follow from the scenario alone.
-
-        If this fails, the last state is kept, and `problem` says why.
-        """
+    def _save(self, state: object) -> None:
+        """Saves a state; if this fails, the last one is kept, and `problem` says why."""
         start_s, old = time.perf_counter(), self._contents["state"]
+        number = old["number"] + 1 if old else 1
+        file = self._folder / f"state-{number}.pickle"
         try:
-            self._save(state, made_anew)
+            _replace(file, lambda stream: _Writer(stream, self._run, self._made_anew).dump(state))
+            self._contents["state"] = {"number": number, "sha256": file_hash(file)}
+            self._write_manifest()
             self.problem = ""
-        except (OSError, MemoryError, pickle.PicklingError, TypeError, AttributeError) as error:  # the last three: a
-            self._contents["state"], self.problem = old, str(error) or type(error).__name__  # plug-in's own objects
-        kept = {self._manifest.name, (self._contents["state"] or {}).get("file")}
-        for file in self._folder.iterdir() if self._folder.is_dir() else ():
-            if file.name not in kept:
-                with suppress(OSError):
-                    file.unlink()
+        except (OSError, MemoryError, pickle.PicklingError, TypeError, AttributeError) as error:
+            # the last three: an object of a plug-in cannot be saved
+            self._contents["state"], self.problem = old, str(error) or type(error).__name__
+        kept = f"state-{(self._contents['state'] or {}).get('number')}.pickle"
+        for other in self._folder.glob("*"):
+            if other not in (self._manifest, self._folder / kept):
+                other.unlink(missing_ok=True)
         self._last_s = time.perf_counter()
         if self._is_default:
             self._interval_s = max(DEFAULT_S, (self._last_s - start_s) / _MOST_SHARE)
-
-    def _save(self, state: object, made_anew: Sequence[object]) -> None:
-        name, hashed = f"state-{self._number + 1}.pickle", hashlib.sha256()
-
-        def write(stream: IO[bytes]) -> None:
-            _Writer(stream, hashed, self._run, made_anew).dump(state)
-
-        _replace(self._folder / name, write)
-        self._number += 1
-        self._contents["state"] = {"file": name, "number": self._number, "sha256": hashed.hexdigest()}
-        self._write_manifest()
 
     def _write_manifest(self) -> None:
         _replace(self._manifest, lambda stream: stream.write(json.dumps(self._contents, indent=1).encode()))
@@ -207,8 +194,8 @@ def _replace(file: Path, write: Callable[[IO[bytes]], object]) -> None:
 class _Writer(pickle.Pickler):
     """Pickler that leaves out the objects `made_anew`, and writes paths in the run folder relative to it."""
 
-    def __init__(self, stream: IO[bytes], hashed: Any, run: Path, made_anew: Sequence[object]):
-        super().__init__(_Hashing(stream, hashed), pickle.HIGHEST_PROTOCOL)
+    def __init__(self, stream: IO[bytes], run: Path, made_anew: Sequence[object]):
+        super().__init__(stream, pickle.HIGHEST_PROTOCOL)
         self._run = run
         self._numbers = {id(one): number for number, one in enumerate(made_anew) if one is not None}
 
@@ -216,17 +203,6 @@ class _Writer(pickle.Pickler):
         if isinstance(obj, Path) and obj.is_relative_to(self._run):
             return str(obj.relative_to(self._run))
         return self._numbers.get(id(obj))
-
-
-class _Hashing:
-    """Stream whose bytes are also hashed."""
-
-    def __init__(self, stream: IO[bytes], hashed: Any):
-        self._stream, self._hashed = stream, hashed
-
-    def write(self, data: Any) -> int:
-        self._hashed.update(data)
-        return self._stream.write(data)
 
 
 class _Reader(pickle.Unpickler):

@@ -55,17 +55,16 @@ class RecordedFrames:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields the usable frames, with indices from 0; `right` is None if the right image cannot be used."""
-        skipped = Counter[str]()
-        if self.dataset.n_right_only:
-            skipped["right image without left image"] = self.dataset.n_right_only
-        return self.following(0, 0, skipped)
+        return self.following(0, 0)
 
-    def following(self, n_read: int, index: int, skipped: Counter[str]) -> Iterator[Frame]:
+    def following(self, n_read: int, index: int, skipped: Counter[str] | None = None) -> Iterator[Frame]:
         """Yields the usable frames after the first `n_read` of the data set, with indices from `index` on.
 
-        `skipped` are the counts of the frames before.
+        `skipped` are the counts of the frames before; None: there are none.
         """
-        self.skipped, self.n_read = skipped.copy(), n_read
+        self.skipped, self.n_read = Counter[str](skipped), n_read
+        if skipped is None and self.dataset.n_right_only:
+            self.skipped["right image without left image"] = self.dataset.n_right_only
         for images, in_order in zip(self.dataset.images[n_read:], self._in_order[n_read:], strict=True):
             self.n_read += 1
             if not in_order:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -37,7 +37,7 @@ from twin.recordings.opened_dataset import OpenedDataset, ReplayOptions, open_da
 from twin.recordings.recorded_aiding import Start
 from twin.report.replay_description import describe_replay
 from twin.report.run_writer import RunFolder, SurveyRecord
-from twin.session.assembly import program, reopened
+from twin.session.assembly import closing, program
 from twin.session.conclusion import Estimation, Maps, conclude
 
 #: A segment of the path ends, and the network is aligned, when the number of keyframes since the last alignment is this
@@ -73,20 +73,18 @@ class _Estimated:
     track: int = 1
     aligned: int = 0  #: number of keyframes at the last alignment
     last_s: float | None = None  #: time of the last frame
-    read: tuple[int, int, Counter[str]] | None = None  #: arguments of `RecordedFrames.following`
+    n_read: int = 0  #: frames of the data set that were read
+    n_frames: int = 0  #: those of them that could be used
+    skipped: Counter[str] | None = None  #: `RecordedFrames.skipped`
     wall_s: float = 0.0
     ended: bool = False
     cause: str = ""  #: why it ended early, "" if it did not
 
 
 def replay(
-    folder: Path,
-    out: Path,
-    options: ReplayOptions | None = None,
-    progress: Progress = lambda stage, share: None,
-    resume: bool = False,
-    checkpoint_s: float | None = None,
-) -> ReplayResult:
+    folder: Path, out: Path, options: ReplayOptions | None = None, progress: Progress = lambda stage, share: None,
+    resume: bool = False, checkpoint_s: float | None = None,
+) -> ReplayResult:  # fmt: skip
     """Runs the estimators on a recorded data set and writes a run folder (`twin.replay`).
 
     An interrupt (Ctrl-C) ends the current stage; the stages after it are completed. `progress` is called with the stage
@@ -106,22 +104,20 @@ def _replay(
     setup, start = _setup(opened, options, settings)
     description = describe_replay(opened.name, _source(opened), setup.rig, settings, options.estimator)
     checkpoints = _checkpoints(opened, options, description.text, out, checkpoint_s)
-    found: _Estimated | None = checkpoints.load(()) if resume else None
+    found: _Estimated | None = checkpoints.open(resume)
     with guard, ExitStack() as resources:
         if found is None:
-            checkpoints.begin()
             written, stopwatch = resources.enter_context(RunFolder(out, description, options.outputs)), Stopwatch()
             images = StereoVision(setup.rig, settings, out / "keyframes", stopwatch=stopwatch, noise=setup.noise)
             navigator = _navigator(setup, start, options.estimator, settings, resources.enter_context(images))
             found = _Estimated(written, resources.enter_context(navigator), stopwatch)
         else:
             resources.enter_context(found.folder)
-            resources.enter_context(reopened(found.navigator))
+            resources.enter_context(closing(found.navigator))
             start_s -= found.wall_s
+            opened.frames.skipped = found.skipped or Counter()
         if not found.ended:
             _estimate_in_stage(opened, found, guard, progress, checkpoints, start_s)
-        elif found.read is not None:
-            opened.frames.skipped = found.read[2]
         guard.cause = found.cause
         estimation = Estimation(found.navigator, found.stopwatch, guard, found.folder, progress, start_s)
         run, survey = conclude(estimation, _Replayed(opened, options, guard))
@@ -132,49 +128,33 @@ def _replay(
 def _checkpoints(
     opened: OpenedDataset, options: ReplayOptions, description: str, out: Path, interval_s: float | None
 ) -> Checkpoints:
-    """Returns the checkpoints of a replay, which belong to its data set, its other files, its options and this program.
+    """Returns the checkpoints of a replay, which belong to its data set, its files, its options and this program.
 
-    Of images, only names and times are compared.
+    Of images in files of their own, only names and times are compared.
     """
     frames = [(images.time_s, images.left.name, images.right and images.right.name) for images in opened.dataset.images]
-    others = replace(options, settings=None)
-    identity = {
-        name: sha256(text.encode()).hexdigest()[:16]
-        for name, text in {"description": description, "options": repr(others), "frames": repr(frames)}.items()
-    }
+    named = repr((description, replace(options, settings=None), frames)).encode()
     folder, given = opened.dataset.folder, (options.calibration, options.truth, options.true_map)
     beside = [folder] if folder.is_file() else [file for file in folder.rglob("*") if file.suffix in _COMPARED]
-    files = (file for file in (*beside, *filter(None, given)) if is_file(file))
-    return Checkpoints(out, identity | program(), files, interval_s)
+    files = [file for file in (*beside, *filter(None, given)) if is_file(file)]
+    return Checkpoints(out, {"replay": sha256(named).hexdigest()[:16]} | program(), files, interval_s)
 
 
 def _estimate_in_stage(
-    opened: OpenedDataset,
-    found: _Estimated,
-    guard: StageGuard,
-    progress: Progress,
-    checkpoints: Checkpoints,
+    opened: OpenedDataset, found: _Estimated, guard: StageGuard, progress: Progress, checkpoints: Checkpoints,
     start_s: float,
-) -> None:
+) -> None:  # fmt: skip
     """Estimates the frames from where a replay is to their end, with checkpoints."""
-
-    def save() -> None:
-        found.wall_s = time.perf_counter() - start_s
-        checkpoints.save(found, ())
-
-    def save_if_due() -> None:
-        if checkpoints.due:
-            save()
-
-    lost = False
     try:
         with guard.stage():
-            _estimate(opened, found, progress, save_if_due)
+            for done in _estimate(opened, found):
+                found.wall_s = time.perf_counter() - start_s
+                progress("replay", done)
+                checkpoints.save_if_due(found)
     except (SurveyAborted, OSError, KeyboardInterrupt) as error:
-        found.cause, lost = str(error) or "interrupted", not isinstance(error, SurveyAborted)
-    found.ended = True
-    if checkpoints.last_due and not lost:
-        save()
+        found.cause = str(error) or "interrupted"
+    found.ended, found.skipped, found.wall_s = True, opened.frames.skipped, time.perf_counter() - start_s
+    checkpoints.save_last(found)
     if checkpoints.problem:
         found.folder.log("no checkpoint", reason=checkpoints.problem)
 
@@ -202,9 +182,10 @@ def _navigator(
     return navigator
 
 
-def _estimate(opened: OpenedDataset, found: _Estimated, progress: Progress, between_frames: Callable[[], None]) -> None:
+def _estimate(opened: OpenedDataset, found: _Estimated) -> Iterator[float]:
+    """Estimates the frames that follow; yields the completed fraction after each of them."""
     frames, navigator = opened.frames, found.navigator
-    for frame in iter(frames) if found.read is None else frames.following(*found.read):
+    for frame in frames.following(found.n_read, found.n_frames, found.skipped):
         if opened.aiding is not None:
             frame = replace(frame, readings=opened.aiding.at(frame.time_s, found.last_s))
             found.last_s = frame.time_s
@@ -213,10 +194,8 @@ def _estimate(opened: OpenedDataset, found: _Estimated, progress: Progress, betw
         if n - found.aligned >= np.clip(_SEGMENT_SHARE * n, *_SEGMENT_KEYFRAMES):
             navigator.align_track(found.track)
             found.track, found.aligned = found.track + 1, n
-        found.read = frames.n_read, frame.index + 1, frames.skipped.copy()
-        progress("replay", min(1.0, (frame.index + 1) / len(frames)))
-        between_frames()
-    found.read = frames.n_read, len(frames), frames.skipped
+        found.n_read, found.n_frames, found.skipped = frames.n_read, frame.index + 1, frames.skipped.copy()
+        yield min(1.0, found.n_frames / len(frames))
 
 
 @dataclass(frozen=True)

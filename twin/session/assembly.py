@@ -67,7 +67,7 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
 
 
 @contextmanager
-def reopened(navigator: Estimators) -> Generator[Estimators]:
+def closing(navigator: Estimators) -> Generator[Estimators]:
     """Closes the estimators of a checkpoint, and the files of their images, at the end."""
     vision = navigator.network.vision
     with vision if isinstance(vision, StereoVision) else nullcontext(), navigator:
