@@ -48,13 +48,9 @@ def load_scenario(
 
 
 def run(
-    scene: str | Path | Scenario,
-    out: str | Path | None = None,
-    overrides: Overrides = (),
-    resume: bool = False,
-    checkpoint_s: float | None = None,
-    **sections: Any,
-) -> RunResult:
+    scene: str | Path | Scenario, out: str | Path | None = None, overrides: Overrides = (),
+    resume: bool = False, checkpoint_s: float | None = None, **sections: Any,
+) -> RunResult:  # fmt: skip
     """Runs a survey and writes its run folder; returns status, metrics, trajectories and maps.
 
     Args:
@@ -237,12 +233,9 @@ def tune(
 
 
 def replay(
-    dataset: str | Path,
-    out: str | Path,
-    options: ReplayOptions | None = None,
-    resume: bool = False,
-    checkpoint_s: float | None = None,
-) -> ReplayResult:
+    dataset: str | Path, out: str | Path, options: ReplayOptions | None = None,
+    resume: bool = False, checkpoint_s: float | None = None,
+) -> ReplayResult:  # fmt: skip
     """Runs the estimators on a recorded stereo data set and writes a run folder; see docs/replay.md.
 
     Args:

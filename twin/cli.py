@@ -86,12 +86,14 @@ SummaryJson = Annotated[bool, option("Print only a summary, as JSON.", flag="--j
 
 def main() -> None:
     """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
+    console.open_closed_streams()
     console.accept_any_text()
     console.hide_log_failures()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `one_blas_thread`; read when numpy is imported, after this
     with sigterm_as_interrupt():
         try:
-            app()
+            with console.machine_errors():
+                app()
         except TwinError as error:
             console.print_error(str(error))
             sys.exit(2)
@@ -598,14 +600,9 @@ def exit_status(result: "RunResult | ReplayResult") -> int:
 
 
 def _run_survey(
-    scene: str | Path,
-    overrides: list[str],
-    out: Path | None,
-    live: bool,
-    allow_plugins: bool = False,
-    resume: bool = False,
-    checkpoint_s: float | None = None,
-) -> "RunResult":
+    scene: str | Path, overrides: list[str], out: Path | None, live: bool, allow_plugins: bool = False,
+    resume: bool = False, checkpoint_s: float | None = None,
+) -> "RunResult":  # fmt: skip
     if resume:
         scene, out = outputs.resumed(scene, out)
     scenario = api.load_scenario(scene, overrides, allow_plugins)

@@ -60,14 +60,9 @@ class _Survey:
 
 
 def run(
-    scenario: Scenario,
-    out: Path,
-    progress: Callable[[SurveyProgress], None] = lambda _: None,
-    live: bool = False,
-    outputs: Collection[str] | None = OPTIONAL_OUTPUTS,
-    resume: bool = False,
-    checkpoint_s: float | None = 0.0,
-) -> RunResult:
+    scenario: Scenario, out: Path, progress: Callable[[SurveyProgress], None] = lambda _: None, live: bool = False,
+    outputs: Collection[str] | None = OPTIONAL_OUTPUTS, resume: bool = False, checkpoint_s: float | None = 0.0,
+) -> RunResult:  # fmt: skip
     """Runs the survey of a scenario and writes a run folder, with the partial results if the survey is aborted.
 
     An interrupt (Ctrl-C) during the flight ends the flight. A later interrupt ends only the current stage: alignment,
@@ -173,14 +168,10 @@ def _log_warnings(mission: Mission, world: World, folder: RunFolder) -> None:
 
 
 def fly(
-    mission: Mission,
-    world: World,
-    navigator: Estimators,
-    observe: Callable[[Estimate, Frame], None],
-    actions: MissionActions | None = None,
-    resumed: _Loop | None = None,
+    mission: Mission, world: World, navigator: Estimators, observe: Callable[[Estimate, Frame], None],
+    actions: MissionActions | None = None, resumed: _Loop | None = None,
     between_frames: Callable[[_Loop], None] = lambda _: None,
-) -> Gaps:
+) -> Gaps:  # fmt: skip
     """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the vehicle.
 
     After each track, the vehicle keeps station while the navigator runs a global alignment. Returns the gaps that were

@@ -152,6 +152,21 @@ def file_hash(file: Path) -> str:
         return ""
 
 
+def check_inputs(folder: Path, inputs: Iterable[Path]) -> None:
+    """Writes the hashes of input files to inputs.json or, if it exists, raises TwinError if a file has changed since.
+
+    Raises OSError if it cannot be written.
+    """
+    record = folder / "inputs.json"
+    before = read_json(record, allowed=_WHOLE) if is_file(record) else {}
+    now = {str(file): file_hash(file) for file in sorted(set(inputs))}
+    for name in now:
+        if isinstance(before, dict) and before.get(name, now[name]) != now[name]:
+            raise TwinError("--resume", f"the file {name} has changed since {record} was written", _SAME)
+    if now != before:
+        _replace(record, lambda stream: stream.write(json.dumps(now, indent=1).encode()))
+
+
 def check_hash(file: Path, expected: str) -> None:
     """Raises TwinError if a file on which a checkpoint depends is missing or has another SHA-256."""
     if file_hash(file) != expected:
