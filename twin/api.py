@@ -48,24 +48,32 @@ def load_scenario(
 
 
 def run(
-    scene: str | Path | Scenario, out: str | Path | None = None, overrides: Overrides = (), **sections: Any
-) -> RunResult:
+    scene: str | Path | Scenario, out: str | Path | None = None, overrides: Overrides = (),
+    resume: bool = False, checkpoint_s: float | None = None, **sections: Any,
+) -> RunResult:  # fmt: skip
     """Runs a survey and writes its run folder; returns status, metrics, trajectories and maps.
 
     Args:
         out: run folder to write, new or empty; default: the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new.
         overrides, sections: values of keys, as in `load_scenario`.
+        resume: whether to continue a survey that was killed, from the last checkpoint in its folder, which is `out` or
+            `scene` itself. A checkpoint is a pickle, which can run any code: resume only in a folder that you trust.
+        checkpoint_s: wall time between checkpoints [s]; 0: none; default: 60, or so much that they take 1 % of the
+            time.
 
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.
-        TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
-            world cannot be created.
+        TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, the
+            world cannot be created, or a checkpoint is damaged or belongs to another scenario, file or program.
     """
     from twin import survey
-    from twin.app.outputs import run_folder
+    from twin.app.outputs import resumed, run_folder
 
-    scenario = _scenario(scene, overrides, sections)
-    return survey.run(scenario, Path(out) if out is not None else run_folder(scenario))
+    file, folder = scene, None if out is None else Path(out)
+    if resume and isinstance(scene, str | Path):
+        file, folder = resumed(scene, folder)
+    scenario = _scenario(file, overrides, sections)
+    return survey.run(scenario, folder or run_folder(scenario, resume), resume=resume, checkpoint_s=checkpoint_s)
 
 
 def plan(
@@ -224,13 +232,18 @@ def tune(
     return study_command.fly_search(str(file), options)[0]
 
 
-def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None = None) -> ReplayResult:
+def replay(
+    dataset: str | Path, out: str | Path, options: ReplayOptions | None = None,
+    resume: bool = False, checkpoint_s: float | None = None,
+) -> ReplayResult:  # fmt: skip
     """Runs the estimators on a recorded stereo data set and writes a run folder; see docs/replay.md.
 
     Args:
         dataset: folder or ROS 2 bag of the data set.
         out: run folder to write, new or empty.
         options: calibration, truth, alignment and settings (`twin.recordings.replay.ReplayOptions`).
+        resume: whether to continue a replay that was killed, from the last checkpoint in `out`; as in `run`.
+        checkpoint_s: wall time between checkpoints [s], as in `run`.
 
     Raises:
         TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder is not
@@ -238,7 +251,7 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
     """
     from twin.recordings import replay as recorded
 
-    return recorded.replay(Path(dataset), Path(out), options)
+    return recorded.replay(Path(dataset), Path(out), options, resume=resume, checkpoint_s=checkpoint_s)
 
 
 def _scenario(scene: str | Path | Scenario, overrides: Overrides, sections: Mapping[str, Any]) -> Scenario:

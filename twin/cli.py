@@ -57,6 +57,13 @@ Overrides = Annotated[
     list[str], option("Override a key of the scenario, as in plan.tracks=2; repeatable.", "KEY=VALUE", flag="--set")
 ]
 RunOut = Annotated[Path | None, option("Folder to write. Default: runs/NAME-SEED.")]
+Resume = Annotated[
+    bool, option("Continue from the last checkpoint in --out; resume only in a folder that you trust.", flag="--resume")
+]
+CheckpointS = Annotated[
+    float | None,
+    option("Seconds between checkpoints; 0: none. Default: 60, or so much that they take 1 % of the time.", "N", min=0),
+]
 OutFolder = Annotated[Path, option("Folder to write.")]
 Quick = Annotated[bool, option("Use smaller plans, images or selections of cases.", flag="--quick")]
 Jobs = Annotated[
@@ -79,12 +86,14 @@ SummaryJson = Annotated[bool, option("Print only a summary, as JSON.", flag="--j
 
 def main() -> None:
     """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
+    console.open_closed_streams()
     console.accept_any_text()
     console.hide_log_failures()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `one_blas_thread`; read when numpy is imported, after this
     with sigterm_as_interrupt():
         try:
-            app()
+            with console.machine_errors():
+                app()
         except TwinError as error:
             console.print_error(str(error))
             sys.exit(2)
@@ -103,13 +112,18 @@ def run(
     seed: Annotated[int | None, option("Seed of all random numbers.", min=0)] = None,
     out: RunOut = None,
     live: Annotated[bool, option("Show the survey in Rerun while it runs.", flag="--live")] = False,
+    resume: Resume = False,
+    checkpoint_s: CheckpointS = None,
     as_json: MetricsJson = False,
     extrapolate: Extrapolate = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
-    """Run one survey and write its folder: map, trajectories, report, recording, metrics."""
+    """Run one survey and write its folder: map, trajectories, report, recording, metrics.
+
+    With --resume, SCENE may be the folder of the survey that was killed.
+    """
     options = ([] if seed is None else [f"seed={seed}"]) + (["imaging.extrapolate=true"] if extrapolate else [])
-    _conclude(_run_survey(scene, overrides + options, out, live, allow_plugins), as_json)
+    _conclude(_run_survey(scene, overrides + options, out, live, allow_plugins, resume, checkpoint_s), as_json)
 
 
 @app.command()
@@ -428,6 +442,8 @@ def replay(
     ] = None,
     baseline: Annotated[float | None, option("Distance between the cameras. Default: the calibration's.", "M")] = None,
     field: Annotated[float | None, option("Horizontal field of view of the rectified images.", "DEG")] = None,
+    resume: Resume = False,
+    checkpoint_s: CheckpointS = None,
     as_json: MetricsJson = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
@@ -448,9 +464,10 @@ def replay(
     if preview:
         _preview(dataset, options, outputs.output_file(out or Path(f"runs/{name}-preview.png")))
         return
-    folder = outputs.new_folder(out) if out is not None else outputs.unused_folder(Path("runs") / f"{name}-replay")
+    folder = out or Path("runs") / f"{name}-replay"
+    folder = outputs.new_folder(folder, used=resume) if out or resume else outputs.unused_folder(folder)
     with console.replay_bar() as progress:
-        result = recorded.replay(dataset, folder, options, progress)
+        result = recorded.replay(dataset, folder, options, progress, resume, checkpoint_s)
     _conclude(result, as_json)
 
 
@@ -580,15 +597,18 @@ def exit_status(result: "RunResult | ReplayResult") -> int:
 
 
 def _run_survey(
-    scene: str, overrides: list[str], out: Path | None, live: bool, allow_plugins: bool = False
-) -> "RunResult":
+    scene: str | Path, overrides: list[str], out: Path | None, live: bool, allow_plugins: bool = False,
+    resume: bool = False, checkpoint_s: float | None = None,
+) -> "RunResult":  # fmt: skip
+    if resume:
+        scene, out = outputs.resumed(scene, out)
     scenario = api.load_scenario(scene, overrides, allow_plugins)
     from twin import survey  # imported here because it takes half a second
 
     # last, because two surveys that begin at once must find different folders
-    folder = outputs.run_folder(scenario) if out is None else outputs.new_folder(out)
+    folder = outputs.run_folder(scenario, resume) if out is None else outputs.new_folder(out, used=resume)
     with console.progress_bar() as progress:
-        return survey.run(scenario, folder, progress, live)
+        return survey.run(scenario, folder, progress, live, resume=resume, checkpoint_s=checkpoint_s)
 
 
 def _conclude(result: "RunResult | ReplayResult", as_json: bool = False) -> NoReturn:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,9 +16,13 @@ from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from twin.errors import TwinError
+
 if TYPE_CHECKING:
     from twin.planning.summary import PlanSummary
     from twin.session.monitor import SurveyProgress
+
+_OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EIO, errno.EROFS)
 
 
 def print_error(text: str) -> None:
@@ -34,6 +40,33 @@ def hide_log_failures() -> None:
             default(failure)
 
     sys.unraisablehook = hook
+
+
+def open_closed_streams() -> None:
+    """Opens the null device in place of closed standard streams, whose numbers the next files would get."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))
+
+
+@contextmanager
+def machine_errors() -> Iterator[None]:
+    """Raises TwinError in place of an error that a full disk, too little memory or too few file descriptors cause."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except (MemoryError, ImportError) as error:
+        if isinstance(error, ImportError) and "failed to map" not in str(error):  # a library does not fit in memory
+            raise
+        raise TwinError("memory", "is used up", "more memory, or a smaller survey") from None
+    except OSError as error:
+        if error.errno not in _OF_THE_MACHINE:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the flush at the end of the program fails again
+        raise TwinError(str(error.filename or "stdout"), str(error.strerror), "one that can be written") from None
 
 
 def accept_any_text() -> None:

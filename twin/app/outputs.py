@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 _STEM_BYTES = 100
 
 
-def new_folder(folder: Path, option: str = "--out") -> Path:
-    check_folder(folder, option)
+def new_folder(folder: Path, option: str = "--out", used: bool = False) -> Path:
+    check_folder(folder, option, used)
     _check_writable(folder, option)
     return folder
 
@@ -34,9 +34,19 @@ def unused_folder(first: Path) -> Path:
     return new_folder(folder)
 
 
-def run_folder(scenario: Scenario) -> Path:
-    """Returns the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty (`unused_folder`)."""
-    return unused_folder(Path("runs") / f"{file_stem(scenario.name)}-{scenario.seed}")
+def run_folder(scenario: Scenario, resume: bool = False) -> Path:
+    """Returns the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty; to resume, the first of all."""
+    first = Path("runs") / f"{file_stem(scenario.name)}-{scenario.seed}"
+    return first if resume else unused_folder(first)
+
+
+def resumed(scene: str | Path, out: Path | None) -> tuple[str | Path, Path | None]:
+    """Returns scenario and run folder of a survey to resume, of which `scene` may be the run folder."""
+    if not Path(scene).is_dir():
+        return scene, out
+    if out is not None and resolved(out) != resolved(Path(scene)):
+        raise TwinError("--out", f"{out} is not the folder to resume, {scene}", "no --out with a run folder")
+    return Path(scene) / "scenario.resolved.toml", Path(scene)
 
 
 def output_file(file: Path, option: str = "--out") -> Path:

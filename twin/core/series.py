@@ -26,6 +26,9 @@ class GrowingArray:
         wrapped._buffer, wrapped._n = rows, len(rows)
         return wrapped
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.wrap, (self.array,)
+
     def __len__(self) -> int:
         return self._n
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,6 +84,19 @@ class KeyframeNetwork:
         self._pending: deque[tuple[Callable[[], list[LinkAttempt]], list[LinkAttempt], list[Link]]] = deque()
         self._alignable = True
         self.reference_cov = _REFERENCE_COV
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the state after all pending links have been measured in the separate thread."""
+        pending = self._pending
+        if self._executor is not None:
+            pending = deque(
+                (partial(list[LinkAttempt], measure()), chain, bridge) for measure, chain, bridge in pending
+            )
+        return vars(self) | {"_executor": None, "_pending": pending}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._executor = ThreadPoolExecutor(1) if self.vision.runs_in_background else None
 
     def close(self) -> None:
         """Drops the pending link measurements and ends the thread, after the measurement in progress."""

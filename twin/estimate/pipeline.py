@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,8 +95,7 @@ class Navigator:
     ):
         self.rig, self.settings = rig, settings or EstimatorSettings()
         self.stopwatch, noise = stopwatch or Stopwatch(), readings_noise or SensorNoise()
-        self._resources = ExitStack()
-        self._resources.enter_context(one_blas_thread())
+        self._resources = _limited_resources()
         self.vision = vision or self._image_vision(folder, noise)
         self.filter = PoseFilter((_DEFAULT_START if start is None else start).copy(), rig, noise)
         self._f2f_at_pair = self._f2f_at_node = self.filter.f2f
@@ -112,6 +111,15 @@ class Navigator:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
         vision = StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch, noise=noise)
         return self._resources.enter_context(vision)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_resources": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores the estimators; `vision` is then closed by the caller in any case."""
+        vars(self).update(state)
+        self._resources = _limited_resources()
+        self._resources.callback(self.network.close)
 
     def __enter__(self) -> Self:
         return self
@@ -507,6 +515,12 @@ class Navigator:
         poses = elevation.map_from_world @ result.final.world_from_camera[rows]
         views = Views(poses, result.keyframe_depth_m, [exposures[int(row)] for row in rows], load)
         return orthomosaic(views, elevation, self.rig.with_square_pixels(), restore, progress or _ignore)
+
+
+def _limited_resources() -> ExitStack:
+    resources = ExitStack()
+    resources.enter_context(one_blas_thread())
+    return resources
 
 
 def _ignore(_: float) -> None:

@@ -72,7 +72,7 @@ class StereoCamera:
         self._left_from_right, self._frame_rate_hz = rig.left_from_right, rig.frame_rate_hz
         body_from_cameras = rig.body_from_camera, rig.body_from_camera @ rig.left_from_right
         self._camera_from_body_twist = [geometry.adjoint(geometry.inverse(pose)) for pose in body_from_cameras]
-        self._sensor, self._psf = sensor_of(scenario, self._cameras.raw_rig), LensPsf(scenario, rig)
+        self._sensor, self.psf = sensor_of(scenario, self._cameras.raw_rig), LensPsf(scenario, rig)
         self._focal_px, self._linear = rig.focal_px, scenario.delivers_linear_images
         self._rngs, self._rng_apart = (left_rng, right_rng), copy.deepcopy(right_rng)
         self._n_captures, self._last_setting = 0, self._sensor.setting
@@ -161,7 +161,7 @@ class StereoCamera:
         motion = sensor.motion(self.twist_of_camera(view.camera, twist_body), setting, len(view.depth))
         if motion is not None:
             motion = motion._replace(rolls_later=self._cameras.sampling is not None)
-        light = light_after_lens(self._image_formation, self._psf, view, self._focal_px, motion)
+        light = light_after_lens(self._image_formation, self.psf, view, self._focal_px, motion)
         return self._cameras.sample(light, view.depth, view.camera, motion=motion)
 
 

@@ -26,6 +26,8 @@ _NOMINAL_HZ = 1.0  # frame rate of a data set without two frames at different ti
 class RecordedFrames:
     """Rectified frames of a data set, one at a time. A frame that cannot be used is skipped and counted.
 
+    `n_read` is the number of frames of the data set that have been read, usable or not.
+
     Times are relative to the first frame, at `start_s` in the clock of the data set. Frames out of the order of time
     are skipped (`increasing`). `skipped` counts frames and right images that could not be used, by reason, while they
     are read.
@@ -45,7 +47,7 @@ class RecordedFrames:
         self._format = image_format(sources, self.size_px, bayer)
         self._in_order = increasing(np.array([frame.time_s for frame in dataset.images]))
         self.start_s = dataset.images[int(np.argmax(self._in_order))].time_s
-        self.skipped = Counter[str]()
+        self.skipped, self.n_read = Counter[str](), 0
 
     def __len__(self) -> int:
         """Returns the number of frames of the data set, including those that will be skipped."""
@@ -53,11 +55,18 @@ class RecordedFrames:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields the usable frames, with indices from 0; `right` is None if the right image cannot be used."""
-        self.skipped = Counter[str]()
-        if self.dataset.n_right_only:
+        return self.following(0, 0)
+
+    def following(self, n_read: int, index: int, skipped: Counter[str] | None = None) -> Iterator[Frame]:
+        """Yields the usable frames after the first `n_read` of the data set, with indices from `index` on.
+
+        `skipped` are the counts of the frames before; None: there are none.
+        """
+        self.skipped, self.n_read = Counter[str](skipped), n_read
+        if skipped is None and self.dataset.n_right_only:
             self.skipped["right image without left image"] = self.dataset.n_right_only
-        index = 0
-        for images, in_order in zip(self.dataset.images, self._in_order, strict=True):
+        for images, in_order in zip(self.dataset.images[n_read:], self._in_order[n_read:], strict=True):
+            self.n_read += 1
             if not in_order:
                 self.skipped[_OUT_OF_ORDER] += 1
                 continue

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from twin.core.checkpoint import Checkpoints
 from twin.core.interrupts import StageGuard
 from twin.core.output_folder import sole_writer
 from twin.core.quality import Finding
@@ -18,6 +21,7 @@ from twin.core.records import ElevationMap, SensorNoise, SurveyResult, Trajector
 from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
+from twin.core.user_files import is_file
 from twin.datasets.image_files import BAYER, Bayer
 from twin.errors import SurveyAborted, TwinError
 from twin.estimate import Navigator
@@ -33,12 +37,14 @@ from twin.recordings.opened_dataset import OpenedDataset, ReplayOptions, open_da
 from twin.recordings.recorded_aiding import Start
 from twin.report.replay_description import describe_replay
 from twin.report.run_writer import RunFolder, SurveyRecord
+from twin.session.assembly import closing, program
 from twin.session.conclusion import Estimation, Maps, conclude
 
 #: A segment of the path ends, and the network is aligned, when the number of keyframes since the last alignment is this
 #: fraction of all keyframes so far, within limits.
 _SEGMENT_SHARE, _SEGMENT_KEYFRAMES = 0.3, (10, 100)
 ESTIMATOR_OPTION = "--estimator"  # option of `twin replay` that names a plug-in
+_COMPARED = (".csv", ".db3", ".mcap", ".tif", ".toml", ".txt", ".xml", ".yaml", ".yml")  # files beside the images
 _MOST_RESIDUAL = 2.0  # largest RMS of the residuals of readings [standard deviations] without a warning
 _MOST_UNUSED = 0.1  # largest fraction of unusable frames of a complete replay
 _ALL_TRACKS = 1000  # every earlier node may be linked to a new one: there is no plan that says where loops close
@@ -57,39 +63,100 @@ class ReplayResult(NamedTuple):
     elevation: ElevationMap | None  #: the map; None if none was built
 
 
+@dataclass
+class _Estimated:
+    """A replay between two frames, or after the last one; all that changes while the frames are estimated."""
+
+    folder: RunFolder
+    navigator: Estimators
+    stopwatch: Stopwatch
+    track: int = 1
+    aligned: int = 0  #: number of keyframes at the last alignment
+    last_s: float | None = None  #: time of the last frame
+    n_read: int = 0  #: frames of the data set that were read
+    n_frames: int = 0  #: those of them that could be used
+    skipped: Counter[str] | None = None  #: `RecordedFrames.skipped`
+    wall_s: float = 0.0
+    ended: bool = False
+    cause: str = ""  #: why it ended early, "" if it did not
+
+
 def replay(
-    folder: Path, out: Path, options: ReplayOptions | None = None, progress: Progress = lambda stage, share: None
-) -> ReplayResult:
+    folder: Path, out: Path, options: ReplayOptions | None = None, progress: Progress = lambda stage, share: None,
+    resume: bool = False, checkpoint_s: float | None = None,
+) -> ReplayResult:  # fmt: skip
     """Runs the estimators on a recorded data set and writes a run folder (`twin.replay`).
 
     An interrupt (Ctrl-C) ends the current stage; the stages after it are completed. `progress` is called with the stage
     ("replay", "map" or "report") and its completed fraction.
     """
-    with sole_writer(out), one_blas_thread():
-        return _replay(folder, out, options or ReplayOptions(), progress)
+    with sole_writer(out, used=resume), one_blas_thread():
+        return _replay(folder, out, options or ReplayOptions(), progress, resume, checkpoint_s)
 
 
-def _replay(folder: Path, out: Path, options: ReplayOptions, progress: Progress) -> ReplayResult:
+def _replay(
+    folder: Path, out: Path, options: ReplayOptions, progress: Progress, resume: bool, checkpoint_s: float | None
+) -> ReplayResult:
     check_loadable(ESTIMATOR_OPTION, ESTIMATORS, options.estimator)
+    start_s, guard = time.perf_counter(), StageGuard()
     opened = open_dataset(folder, options)
     settings = replace(options.settings or EstimatorSettings(), window_tracks=_ALL_TRACKS, wide_search=True)
     setup, start = _setup(opened, options, settings)
-    stopwatch, guard, start_s = Stopwatch(), StageGuard(), time.perf_counter()
     description = describe_replay(opened.name, _source(opened), setup.rig, settings, options.estimator)
-    with (
-        guard,
-        RunFolder(out, description, options.outputs) as written,
-        StereoVision(setup.rig, settings, out / "keyframes", stopwatch=stopwatch, noise=setup.noise) as vision,
-        _navigator(setup, start, options.estimator, settings, vision) as navigator,
-    ):
-        try:
-            with guard.stage():
-                _estimate(opened, navigator, progress)
-        except (SurveyAborted, OSError, KeyboardInterrupt) as error:
-            guard.cause = str(error) or "interrupted"
-        estimation = Estimation(navigator, stopwatch, guard, written, progress, start_s)
+    checkpoints = _checkpoints(opened, options, description.text, out, checkpoint_s)
+    found: _Estimated | None = checkpoints.open(resume)
+    with guard, ExitStack() as resources:
+        if found is None:
+            written, stopwatch = resources.enter_context(RunFolder(out, description, options.outputs)), Stopwatch()
+            images = StereoVision(setup.rig, settings, out / "keyframes", stopwatch=stopwatch, noise=setup.noise)
+            navigator = _navigator(setup, start, options.estimator, settings, resources.enter_context(images))
+            found = _Estimated(written, resources.enter_context(navigator), stopwatch)
+        else:
+            resources.enter_context(found.folder)
+            resources.enter_context(closing(found.navigator))
+            start_s -= found.wall_s
+            opened.frames.skipped = found.skipped or Counter()
+        if not found.ended:
+            _estimate_in_stage(opened, found, guard, progress, checkpoints, start_s)
+        guard.cause = found.cause
+        estimation = Estimation(found.navigator, found.stopwatch, guard, found.folder, progress, start_s)
         run, survey = conclude(estimation, _Replayed(opened, options, guard))
+    checkpoints.remove()
     return ReplayResult(run.status, run.metrics, out, survey.result, survey.elevation)
+
+
+def _checkpoints(
+    opened: OpenedDataset, options: ReplayOptions, description: str, out: Path, interval_s: float | None
+) -> Checkpoints:
+    """Returns the checkpoints of a replay, which belong to its data set, its files, its options and this program.
+
+    Of images in files of their own, only names and times are compared.
+    """
+    frames = [(images.time_s, images.left.name, images.right and images.right.name) for images in opened.dataset.images]
+    named = repr((description, replace(options, settings=None), frames)).encode()
+    folder, given = opened.dataset.folder, (options.calibration, options.truth, options.true_map)
+    beside = [folder] if folder.is_file() else [file for file in folder.rglob("*") if file.suffix in _COMPARED]
+    files = [file for file in (*beside, *filter(None, given)) if is_file(file)]
+    return Checkpoints(out, {"replay": sha256(named).hexdigest()[:16]} | program(), files, interval_s)
+
+
+def _estimate_in_stage(
+    opened: OpenedDataset, found: _Estimated, guard: StageGuard, progress: Progress, checkpoints: Checkpoints,
+    start_s: float,
+) -> None:  # fmt: skip
+    """Estimates the frames from where a replay is to their end, with checkpoints."""
+    try:
+        with guard.stage():
+            for done in _estimate(opened, found):
+                found.wall_s = time.perf_counter() - start_s
+                progress("replay", done)
+                checkpoints.save_if_due(found)
+    except (SurveyAborted, OSError, KeyboardInterrupt) as error:
+        found.cause = str(error) or "interrupted"
+    found.ended, found.skipped, found.wall_s = True, opened.frames.skipped, time.perf_counter() - start_s
+    checkpoints.save_last(found)
+    if checkpoints.problem:
+        found.folder.log("no checkpoint", reason=checkpoints.problem)
 
 
 def _setup(opened: OpenedDataset, options: ReplayOptions, settings: EstimatorSettings) -> tuple[EstimatorSetup, Start]:
@@ -115,18 +182,20 @@ def _navigator(
     return navigator
 
 
-def _estimate(opened: OpenedDataset, navigator: Estimators, progress: Progress) -> None:
-    track, aligned, frames, last_s = 1, 0, opened.frames, None
-    for k, frame in enumerate(frames):
+def _estimate(opened: OpenedDataset, found: _Estimated) -> Iterator[float]:
+    """Estimates the frames that follow; yields the completed fraction after each of them."""
+    frames, navigator = opened.frames, found.navigator
+    for frame in frames.following(found.n_read, found.n_frames, found.skipped):
         if opened.aiding is not None:
-            frame = replace(frame, readings=opened.aiding.at(frame.time_s, last_s))
-            last_s = frame.time_s
-        navigator.update(frame, track)
+            frame = replace(frame, readings=opened.aiding.at(frame.time_s, found.last_s))
+            found.last_s = frame.time_s
+        navigator.update(frame, found.track)
         n = len(navigator.network.keyframes)
-        if n - aligned >= np.clip(_SEGMENT_SHARE * n, *_SEGMENT_KEYFRAMES):
-            navigator.align_track(track)
-            track, aligned = track + 1, n
-        progress("replay", min(1.0, (k + 1) / len(frames)))
+        if n - found.aligned >= np.clip(_SEGMENT_SHARE * n, *_SEGMENT_KEYFRAMES):
+            navigator.align_track(found.track)
+            found.track, found.aligned = found.track + 1, n
+        found.n_read, found.n_frames, found.skipped = frames.n_read, frame.index + 1, frames.skipped.copy()
+        yield min(1.0, found.n_frames / len(frames))
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import csv
 from collections import deque
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TextIO
 
 import cv2
 import numpy as np
 
-from twin.core.records import Array, Frame, Image, ImuReadings, Readings
+from twin.core.checkpoint import flushed_length, reopened
+from twin.core.records import Array, Frame, Image, Readings
 from twin.core.series import GrowingArray
 
 Record = Literal["none", "keyframes", "all"]
@@ -23,6 +25,7 @@ IMU_COLUMNS = ("time_s", "rate_x_radps", "rate_y_radps", "rate_z_radps", "specif
                "specific_force_y_mps2", "specific_force_z_mps2")  # fmt: skip
 #: Columns of `Frame.exposure` in frames/frames.csv, after index, time_s and stereo; empty if the cameras report none.
 EXPOSURE_COLUMNS = ("exposure_r", "exposure_g", "exposure_b")
+_FRAMES, _IMU = "frames.csv", "imu.csv"
 _MOST_WAITING = 8  # frames whose images wait to be written; a survey waits for the disk beyond this number
 #: PNG in half the time of the default filters and strategy; the files are 6 % larger.
 _PNG = [
@@ -49,25 +52,34 @@ class FrameRecorder:
         self._poses, self._twists = GrowingArray(4, 4), GrowingArray(6)
         self._writer = ThreadPoolExecutor(1)  # compresses while the next frame is rendered
         self._waiting: deque[Future[None]] = deque()
-        self._lines, self._imu_lines = None, None
+        self._tables: dict[str, TextIO] = {}
         if record != "none":
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._lines = (self._folder / "frames.csv").open("w", newline="", encoding="utf-8")
-            self._rows = csv.writer(self._lines)
-            self._rows.writerow(["index", "time_s", "stereo", *EXPOSURE_COLUMNS, *READING_COLUMNS])
+            self._add_rows(_FRAMES, [["index", "time_s", "stereo", *EXPOSURE_COLUMNS, *READING_COLUMNS]])
         if record == "all":
             for side in ("left", "right"):
                 (self._folder / side).mkdir(exist_ok=True)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the state after all images have been written; of the two tables, their lengths [bytes]."""
+        while self._waiting:
+            self._waiting.popleft().result()
+        lengths = {name: flushed_length(file) for name, file in self._tables.items()}
+        return vars(self) | {"_writer": None, "_tables": lengths}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._writer = ThreadPoolExecutor(1)
+        self._tables = {name: reopened(self._folder / name, length) for name, length in state["_tables"].items()}
 
     def __enter__(self) -> FrameRecorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._writer.shutdown()
-        if self._lines is not None:
-            self._lines.close()
-            if self._imu_lines is not None:
-                self._imu_lines.close()
+        for file in self._tables.values():
+            file.close()
+        if self._record != "none":
             truth = {"world_from_camera": self._poses.array, "twist_body": self._twists.array}
             np.savez(self._folder / "truth.npz", allow_pickle=False, **truth)
         if kind is None:
@@ -80,26 +92,28 @@ class FrameRecorder:
         The true pose (4, 4) is that of the left camera, `twist_body` (6,) the true [angular, linear] velocity in body
         axes [rad/s, m/s].
         """
-        if self._lines is None:
+        if self._record == "none":
             return
         self._poses.append(world_from_camera)
         self._twists.append(np.asarray(twist_body, np.float64))
         exposure = ["", "", ""] if frame.exposure is None else [repr(float(value)) for value in frame.exposure]
         stereo = int(frame.right is not None)
-        self._rows.writerow([frame.index, repr(float(frame.time_s)), stereo, *exposure, *_cells(frame.readings)])
+        cells = [frame.index, repr(float(frame.time_s)), stereo, *exposure, *_cells(frame.readings)]
+        self._add_rows(_FRAMES, [cells])
         if frame.readings.imu is not None:
-            self._add_imu(frame.readings.imu)
+            if _IMU not in self._tables:
+                self._add_rows(_IMU, [IMU_COLUMNS])
+            table = np.column_stack(frame.readings.imu).tolist()
+            self._add_rows(_IMU, ([repr(value) for value in row] for row in table))
         if self._record == "all":
             while len(self._waiting) >= _MOST_WAITING or (self._waiting and self._waiting[0].done()):
                 self._waiting.popleft().result()
             self._waiting.append(self._writer.submit(self._write, frame.index, frame.left, frame.right))
 
-    def _add_imu(self, readings: ImuReadings) -> None:
-        if self._imu_lines is None:
-            self._imu_lines = (self._folder / "imu.csv").open("w", newline="", encoding="utf-8")
-            csv.writer(self._imu_lines).writerow(IMU_COLUMNS)
-        table = np.column_stack(readings)
-        csv.writer(self._imu_lines).writerows([repr(value) for value in row] for row in table.tolist())
+    def _add_rows(self, name: str, rows: Iterable[Sequence[object]]) -> None:
+        if name not in self._tables:
+            self._tables[name] = (self._folder / name).open("w", newline="", encoding="utf-8")
+        csv.writer(self._tables[name]).writerows(rows)
 
     def _write(self, index: int, left: Image, right: Image | None) -> None:
         for side, image in (("left", left), ("right", right)):

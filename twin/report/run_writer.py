@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.checkpoint import flushed_length, reopened
 from twin.core.georeference import Georeference
 from twin.core.interrupts import StageGuard
 from twin.core.records import Array, ElevationMap, MapGrid, SurveyResult, Trajectory, Truth
@@ -37,6 +38,7 @@ OPTIONAL_OUTPUTS = ("report", "recording")
 #: Glob patterns of the files that each interruptible stage of the writing creates.
 _FILES = {"maps": ("*.tif", "task_*/*.tif", "mesh.glb"), "report": ("report.html",), "recording": ("run.rrd",)}
 _ERROR_LAYER = "estimated minus true elevation [m]"  # description of the band of dem_error.tif
+_LOG = "log.jsonl"
 _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are written, to free space on a full disk
 
 
@@ -87,13 +89,21 @@ class RunFolder:
         self.path, self._reserve, self._outputs = folder, folder / ".reserve", outputs
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._log = (folder / "log.jsonl").open("w", encoding="utf-8")
+            self._log = (folder / _LOG).open("w", encoding="utf-8")
             self._write("scenario.resolved.toml", text)
             self._write("env.json", json.dumps(environment(), indent=1))
             self._reserve.write_bytes(bytes(_RESERVE_BYTES))
         except OSError as error:
             raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder with space") from None
         self.log("started", name=scenario.name, seed=scenario.seed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_log": flushed_length(self._log)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._log = reopened(self.path / _LOG, state["_log"])
+        self._reserve.write_bytes(bytes(_RESERVE_BYTES))
 
     def __enter__(self) -> RunFolder:
         return self
@@ -144,8 +154,8 @@ class RunFolder:
             degraded = f"; {metrics['reason']}" if metrics["status"] == "degraded" else ""
             metrics = metrics | {"status": "aborted", "reason": guard.reason + degraded}
             self._write(temporary, json.dumps(metrics, indent=1))
-        (self.path / temporary).replace(self.path / "metrics.json")
         self.log(metrics["status"], reason=metrics["reason"])
+        (self.path / temporary).replace(self.path / "metrics.json")
         return metrics
 
     @property

@@ -26,7 +26,7 @@ Describe = Callable[[TwinError], str]
 #: Keys whose value is the path of a file, without the numbers of list items.
 _PATH_KEYS = (
     "imaging.error_model", "objects.mesh_file", "plan.polygon", "terrain.height_file", "terrain.mesh_file",
-    "terrain.orthophoto_file", "terrain.texture_file", "water.spectrum_file", "current.file",
+    "terrain.orthophoto_file", "terrain.prior_file", "terrain.texture_file", "water.spectrum_file", "current.file",
 )  # fmt: skip
 #: Old keys of the scenario and their new names.
 _RENAMED_KEYS = {
@@ -166,6 +166,22 @@ def dump_toml(scenario: Scenario) -> str:
     require = tree.pop("require")
     tables = {key: tree.pop(key) for key in ("lamps", "beacons", "objects")}
     return tomlkit.dumps(tree | {key: items for key, items in tables.items() if items} | {"require": require})
+
+
+def input_files(scenario: Scenario) -> list[Path]:
+    """Returns the files that the keys of a scenario name."""
+
+    def named(key: str, value: Any) -> Iterator[Path]:
+        if isinstance(value, dict):
+            for name, item in value.items():
+                yield from named(f"{key}.{name}" if key else name, item)
+        elif isinstance(value, list):
+            for item in value:
+                yield from named(key, item)
+        elif isinstance(value, str) and _is_path_key(key):
+            yield Path(value)
+
+    return list(named("", scenario.model_dump(mode="json", exclude_none=True)))
 
 
 def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:

@@ -3,17 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import cache
 from pathlib import Path
 
+from twin.core.checkpoint import Checkpoints
 from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision_interface import Vision
+from twin.kernels import source_hash
 from twin.plugin.navigator import Estimators, navigator_of
 from twin.plugin.protocols import EstimatorSetup
+from twin.report.run_writer import environment
+from twin.scenario.file import input_files
+from twin.scenario.model import Scenario
 from twin.world.mission import Mission
 from twin.world.world import World
+
+_OF_THE_MACHINE = ("machine", "system", "cpus")  # of env.json: other machines may continue a run if the rest is equal
+
+
+def checkpoints_of(scenario: Scenario, out: Path, interval_s: float | None) -> Checkpoints:
+    """Returns the checkpoints of a survey, which belong to its scenario, its input files and this program."""
+    identity = {"scenario": scenario.fingerprint(), "record": scenario.record} | program()
+    return Checkpoints(out, identity, input_files(scenario), interval_s)
+
+
+@cache
+def program() -> dict[str, str]:
+    """Returns what results depend on to the last bit: a hash of the sources, with the processor, and the packages."""
+    versions = {name: text for name, text in environment().items() if name not in _OF_THE_MACHINE}
+    return versions | {"sources": source_hash(Path(__file__).parent.parent / "api.py")}
 
 
 def open_world(mission: Mission, stopwatch: StageTimer) -> World:
@@ -42,6 +63,14 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
     plugin, settings = mission.scenario.estimate.plugin, mission.scenario.estimator_settings()
     setup = EstimatorSetup(mission.rig, mission.start, mission.scenario.believed_noise())
     with image_vision(mission, folder, stopwatch) as vision, navigator_of(plugin, setup, settings, vision) as navigator:
+        yield navigator
+
+
+@contextmanager
+def closing(navigator: Estimators) -> Generator[Estimators]:
+    """Closes the estimators of a checkpoint, and the files of their images, at the end."""
+    vision = navigator.network.vision
+    with vision if isinstance(vision, StereoVision) else nullcontext(), navigator:
         yield navigator
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from twin.core.records import REPEATS, Estimate, Frame
 from twin.errors import SurveyAborted
@@ -46,14 +46,25 @@ class SurveyMonitor:
         self.folder, self.progress, self.start_s = folder, progress, time.perf_counter()
         self.live = None
         if live:
-            from twin.report.recording import LiveViewer
-
-            self.live = LiveViewer(mission.rig)
+            self.show_live(mission)
         self.status = "ok"
         longest_s = _WITH_DVL_S if "dvl" in mission.scenario.navigation.aiding else _MAX_BLIND_S
         self._measured = deque([True] * round(longest_s * self.rate_hz))
         self.actions = MissionActions(mission, folder.log)
         self.max_sigma_m = _MAX_SIGMA * min(mission.plan.request.footprint_m)
+
+    def show_live(self, mission: Mission) -> None:
+        from twin.report.recording import LiveViewer
+
+        self.live = LiveViewer(mission.rig)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"live": None, "start_s": self.wall_s}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores the monitor; the time between the checkpoint and now does not count."""
+        vars(self).update(state)
+        self.start_s = time.perf_counter() - state["start_s"]
 
     def __call__(self, estimate: Estimate, frame: Frame) -> None:
         """Reports progress and vision status of a frame; raises SurveyAborted if the survey cannot continue."""

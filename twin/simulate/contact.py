@@ -51,6 +51,11 @@ def floor_field(
 OPEN_WATER = floor_field(np.full((2, 2), -np.inf, np.float32), 1.0, 0.0, 0.0, HullBox(np.ones(3), np.zeros(3)))
 
 
+def nothing(world_from_body: Array) -> str:
+    """Returns the obstacle that the hull touches in open water."""
+    return ""
+
+
 def contact_error(obstacle: str, time_s: float, world_from_body: Array) -> SurveyAborted:
     x, y, z = world_from_body[:3, 3]
     return SurveyAborted(f"contact of the hull with {obstacle} at {time_s:.2f} s, x {x:.2f}, y {y:.2f}, z {z:.2f} m")

@@ -20,7 +20,7 @@ class Altimeter:
     """
 
     def __init__(self, settings: NavigationConfig, floor: HeightField, rng: np.random.Generator):
-        self._settings, self._floor, self._rng = settings, floor, rng
+        self._settings, self.floor, self._rng = settings, floor, rng
         rings = np.tan(np.deg2rad(settings.altimeter_beam_deg / 2)) * np.arange(1, _BEAM_RINGS + 1) / _BEAM_RINGS
         angles = np.arange(_BEAM_RAYS) * (2 * np.pi / _BEAM_RAYS)
         ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -29,7 +29,7 @@ class Altimeter:
     def read(self, world_from_camera: Array) -> float | None:
         """Returns the distance to the floor [m]; None outside the range of the sensor."""
         number = float(self._rng.standard_normal())
-        depths = [cast_camera_ray(self._floor, world_from_camera, a, b) for a, b in self._rays.tolist()]
+        depths = [cast_camera_ray(self.floor, world_from_camera, a, b) for a, b in self._rays.tolist()]
         distance_m = float(np.min(np.array(depths) * np.sqrt(1 + (self._rays**2).sum(axis=1))))
         nearest_m, farthest_m = self._settings.altimeter_range_m
         if not nearest_m <= distance_m <= farthest_m:
@@ -45,7 +45,7 @@ class BottomLock:
     """
 
     def __init__(self, range_m: tuple[float, float], beam_deg: float, floor: HeightField):
-        self._range_m, self._floor = range_m, floor
+        self._range_m, self.floor = range_m, floor
         azimuths, tilt = np.deg2rad([45.0, 135.0, 225.0, 315.0]), np.deg2rad(beam_deg)
         across = np.sin(tilt) * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
         self._beams = np.column_stack([across, np.full(4, -np.cos(tilt))])
@@ -53,6 +53,6 @@ class BottomLock:
     def holds(self, world_from_body: Array) -> bool:
         """Returns whether enough beams return an echo at a true pose (4, 4)."""
         directions, (x, y, z) = self._beams @ world_from_body[:3, :3].T, world_from_body[:3, 3]
-        lengths_m = np.array([cast_ray(self._floor, x, y, z, *direction) for direction in directions])
+        lengths_m = np.array([cast_ray(self.floor, x, y, z, *direction) for direction in directions])
         nearest_m, farthest_m = self._range_m
         return int(((nearest_m <= lengths_m) & (lengths_m <= farthest_m)).sum()) >= _LEAST_BEAMS

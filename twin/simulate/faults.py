@@ -51,6 +51,7 @@ class Faults:
         self._of_places = [fault for fault in faults if fault.at_m is not None]  # that the vehicle has not reached
         self._gusts = [fault for fault in faults if fault.type == "gust"]
         self._active: list[FaultConfig] = []
+        self._all = list(faults)
         self._kept: dict[tuple[int, object], Any] = {}  # by fault and kind of data: what a stuck part repeats
         self.events: list[FaultEvent] = []
         self.exist = bool(faults)
@@ -69,7 +70,7 @@ class Faults:
             for fault in new:
                 if not any(fault is other for other in old):
                     self.events.append(FaultEvent(time_s, fault, starts))
-        ended = {id(fault) for fault in self._active} - {id(fault) for fault in active}
+        ended = {self._number(fault) for fault in self._active} - {self._number(fault) for fault in active}
         self._kept = {key: value for key, value in self._kept.items() if key[0] not in ended}
         self._active = active
 
@@ -86,7 +87,7 @@ class Faults:
         for fault in self._of("thruster"):
             k = (fault.number or 1) - 1
             if fault.type == "stuck":
-                command[k] = self._kept.setdefault((id(fault), "command"), command[k])
+                command[k] = self._kept.setdefault((self._number(fault), "command"), command[k])
             elif fault.type == "wrong":
                 factors[k] *= fault.size
             elif self._is_lost(fault):
@@ -150,7 +151,7 @@ class Faults:
 
     def _faulty_image(self, fault: FaultConfig, camera: int, image: Image) -> Image:
         if fault.type == "stuck":
-            kept: Image = self._kept.setdefault((id(fault), camera), image)
+            kept: Image = self._kept.setdefault((self._number(fault), camera), image)
             return kept
         if fault.type == "garbage":
             return self._rng.integers(0, 256, image.shape, np.uint8)
@@ -168,7 +169,7 @@ class Faults:
 
     def _faulty_reading(self, fault: FaultConfig, value: Any) -> Any:
         if fault.type == "stuck":
-            return self._kept.setdefault((id(fault), "reading"), value)
+            return self._kept.setdefault((self._number(fault), "reading"), value)
         if fault.type in ("wrong", "garbage"):
             size = np.deg2rad(fault.size) if fault.part == "ahrs" else fault.size
             return value + size * (self._rng.standard_normal(np.shape(value)) if fault.type == "garbage" else 1.0)
@@ -176,12 +177,15 @@ class Faults:
 
     def _late_reading(self, fault: FaultConfig, value: Any) -> Any:
         """Returns the newest reading that arrives now, None if none does."""
-        waiting, found = self._kept.setdefault((id(fault), "readings"), []), None
+        waiting, found = self._kept.setdefault((self._number(fault), "readings"), []), None
         if value is not None:
             waiting.append((self._time_s + fault.size, value))
         while waiting and waiting[0][0] <= self._time_s + 1e-9:
             found = waiting.pop(0)[1]
         return found
+
+    def _number(self, fault: FaultConfig) -> int:
+        return next(k for k, one in enumerate(self._all) if one is fault)
 
     def _is_lost(self, fault: FaultConfig) -> bool:
         return fault.type == "off" or (fault.type == "intermittent" and self._rng.uniform() < fault.size)

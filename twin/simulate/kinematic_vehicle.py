@@ -8,7 +8,7 @@ import numpy as np
 
 from twin.core.geometry import Array
 from twin.errors import SurveyAborted
-from twin.simulate.contact import contact_error
+from twin.simulate.contact import contact_error, nothing
 from twin.simulate.sensors import inertial_quantities
 
 
@@ -29,7 +29,7 @@ class KinematicVehicle:
         self._velocity = np.zeros(3)
         self.inertial = inertial_quantities(world_from_body[:3, :3], np.zeros(3), np.zeros(3))
         self.after_timestep: Callable[[Array], None] | None = None
-        self.touched: Callable[[Array], str] = lambda _: ""
+        self.touched: Callable[[Array], str] = nothing
 
     @property
     def twist_body(self) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
 from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.compiled_vehicle import AT_REST
-from twin.simulate.contact import contact_error
+from twin.simulate.contact import contact_error, nothing
 from twin.simulate.fins import add_fins, fins_of, set_fin_commands, step_fins, velocity_through_water
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
@@ -66,7 +67,20 @@ class MujocoVehicle:
         self._velocity[:3] = start_velocity_mps
         mujoco.mj_step1(model, self._data)
         self.after_timestep: Callable[[Array], None] | None = None
-        self.touched: Callable[[Array], str] = lambda _: ""
+        self.touched: Callable[[Array], str] = nothing
+
+    def __getstate__(self) -> dict[str, Any]:
+        whole = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(self._model, whole))
+        mujoco.mj_getState(self._model, self._data, state, whole)
+        return vars(self) | {"_data": state, "_velocity": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_setState(self._model, self._data, state["_data"], mujoco.mjtState.mjSTATE_INTEGRATION)
+        self._velocity = self._data.qvel[self._dofs]
+        mujoco.mj_step1(self._model, self._data)
 
     @property
     def time_s(self) -> float:

@@ -91,6 +91,13 @@ class ResultsLog:
         return whole.select(sorted(whole.column_names, key=_column_order)).combine_chunks()
 
 
+def cut_torn_line(file: Path) -> None:
+    """Removes an unfinished last line, e.g. of a power failure, from a file, which may be missing."""
+    if file.exists():
+        data = file.read_bytes()
+        os.truncate(file, data.rfind(b"\n") + 1)
+
+
 def key_of(row: Row) -> tuple[int, int]:
     return row["sample"], row["seed"]
 

@@ -7,14 +7,16 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from itertools import takewhile
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import NamedTuple
 
+from twin.core.checkpoint import check_inputs
 from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
 from twin.engines.engine import Engine
 from twin.engines.worker import OUT_OF_TIME, Outcome, TaskLimits
 from twin.errors import TwinError
+from twin.scenario.file import input_files
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import Row, fly, refused_row, row_of
 from twin.studies.progress import StudyProgress
@@ -143,6 +145,7 @@ def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLo
     rows = [refused_row(one, seed, refused[one.number]) for one in refusals_of for seed in seeds_of_sample(study, one)]
     hashes |= {key_of(row): "" for row in rows}
     check_results(log, hashes)
+    check_inputs(folder, chain.from_iterable(input_files(one.scenario) for one in surveys(study, folder, refused)))
     done = log.done()
     if done and done.isdisjoint(hashes):
         raise _another_study(log)

@@ -49,7 +49,8 @@ class SurrogateWorld(World):
             )  # fmt: skip
         else:
             vehicle = KinematicVehicle(mission.start_of_body)
-            vehicle.touched = Obstacles(replace(mission, objects=())).touched
+            self._obstacles = Obstacles(replace(mission, objects=()))
+            vehicle.touched = self._obstacles.touched
         noise, project = scenario.believed_noise(), mission.true_cameras.project
         sensors = NavigationSensors(scenario.navigation, noise, rig, rng, project)
         super().__init__(mission, stopwatch, vehicle, sensors)
@@ -61,6 +62,11 @@ class SurrogateWorld(World):
             self.warnings += ("The surrogate surveys the bare sea floor: it does not simulate [[objects]].",)
         if mission.mesh_floor is not None:
             self.warnings += ("The surrogate surveys the highest surface of the mesh: it simulates no overhangs.",)
+
+    @property
+    def made_anew(self) -> tuple[object, ...]:
+        floor = self.vehicle.state.floor if isinstance(self.vehicle, CompiledVehicle) else self._obstacles
+        return (*super().made_anew, floor, self.vision.floor, self.vision.matchability)
 
     def close(self) -> None:
         pass

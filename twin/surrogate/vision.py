@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +39,7 @@ from twin.surrogate.map_model import MapModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import MeasuredRows, measured_view
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
+from twin.terrains import Terrain
 from twin.world.mission import Mission
 from twin.world.top_surface import true_heights
 from twin.world.world import streams
@@ -124,10 +124,7 @@ class SurrogateVision:
         self._tracked_view = view  # of the keyframe whose points are tracked
         self.floor = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
         self.rig = rig = mission.rig.binned(matchability.binning)
-        floor = self.floor
-        self._map_model_of: Callable[[MapGrid], MapModel] = lambda grid: MapModel(
-            grid, true_heights(grid, terrain.height_at), rig, floor, matchability, view
-        )
+        self._map_model_of = partial(_map_model, terrain, (rig, self.floor, matchability, view))
         self.map_model = self._map_model_of(mission.grid)
         self.settings, self.model, self.stopwatch = settings, model, stopwatch
         self._true_pose, self._rng = true_pose, rng
@@ -153,9 +150,7 @@ class SurrogateVision:
         self.frame_errors: FrameErrors | None = None
         self._last_motion, self._blind_s = np.eye(4), 0.0  # blind: time without points to track
         self._mosaic = MosaicModel()
-        self._link_key, self._link_lock = int(rng.integers(2**63)), Lock()
-        self._link_rng = np.random.Generator(np.random.Philox(0))
-        self._link_rng_state: Any = self._link_rng.bit_generator.state
+        self._link_key = int(rng.integers(2**63))
         self._normals, self._n_used = np.zeros((0, 6)), 0
         self._relief_noise = rng.standard_normal((_RELIEF_CELLS, _RELIEF_CELLS, 2))
         origin = np.zeros((1, 2))
@@ -353,10 +348,8 @@ class SurrogateVision:
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns standard normal numbers (n, 3) of a link, which depend on seed and keyframe numbers only."""
-        state = self._link_rng_state | {"state": {"key": [self._link_key, 0], "counter": [0, 0, number, other]}}
-        with self._link_lock:  # links may be measured in several threads at once
-            self._link_rng.bit_generator.state = state
-            return self._link_rng.standard_normal((n, 3))
+        stream = np.random.Philox(key=[self._link_key, 0], counter=[0, 0, number, other])
+        return np.random.Generator(stream).standard_normal((n, 3))
 
     def left_image(self, row: int) -> Image | None:
         return None
@@ -391,6 +384,10 @@ class SurrogateVision:
             self._normals, self._n_used = np.concatenate([self._normals[self._n_used :], fresh]), 0
         self._n_used += n
         return self._normals[self._n_used - n : self._n_used]
+
+
+def _map_model(terrain: Terrain, known: tuple[Any, ...], grid: MapGrid) -> MapModel:
+    return MapModel(grid, true_heights(grid, terrain.height_at), *known)
 
 
 def _matchability(mission: Mission) -> Matchability:

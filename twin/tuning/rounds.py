@@ -8,7 +8,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from twin.core.checkpoint import check_inputs
 from twin.report.number_formats import percent
+from twin.scenario.file import input_files
 from twin.scenario.model import Scenario
 from twin.studies.flight import Row
 from twin.studies.results_log import ResultsLog, key_of, write_parquet
@@ -91,6 +93,7 @@ def tune(study: Study, folder: Path, resume: bool, fleet: Fleet) -> TuningResult
     CandidateSurveys(study, folder, ()).check_bounds()
     with open_folder(folder, resume, search=True) as log:
         tuning, interrupted, out_of_time = Tuning(study, folder, fleet, log), False, False
+        check_inputs(folder, input_files(tuning.trials.original))
         try:
             tuning.run()
         except KeyboardInterrupt:

@@ -16,7 +16,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from twin.errors import TwinError
 from twin.judge.verdict import more_is_better
-from twin.studies.results_log import JOURNAL_FILE
+from twin.studies.results_log import JOURNAL_FILE, cut_torn_line
 from twin.studies.study_file import Study, TuningConfig
 
 NAME = "twin"  #: name of the Optuna study of the first round in the journal
@@ -35,6 +35,7 @@ class Search:
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, fingerprint: str, search_round: int = 0):
         optuna.logging.set_verbosity(optuna.logging.ERROR)
+        cut_torn_line(folder / JOURNAL_FILE)
         self.config, self.seed, self.first_number = config, study.sampling.seed, search_round * ROUND_NUMBERS
         further = max(min(config.batch, config.trials), config.trials // 4)  # candidates of a further round
         self.n_trials = further if search_round else config.trials
@@ -82,15 +83,16 @@ class Search:
     def next_batch(self) -> dict[int, Trial]:
         """Returns the candidates to evaluate next, by number; none after the last trial of this round.
 
-        They are those that an interrupted search left unfinished, or a new batch, which depends only on the earlier
-        trials and the seed of the study.
+        They are those that an interrupted search left unfinished, with the rest of their batch, or a new batch. Each
+        depends only on the trials evaluated before its batch, its number and the seed of the study.
         """
         known = self._trials()
         batch = [Trial(self.optuna_study, trial._trial_id) for trial in known if trial.state == TrialState.RUNNING]
-        if not batch:
-            self.optuna_study.sampler = TPESampler(seed=self.seed + len(known), multivariate=True)
-            own = sum(_EARLIER not in trial.user_attrs for trial in known)
-            batch = [self.optuna_study.ask(self.space) for _ in range(min(self.config.batch, self.n_trials - own))]
+        own = sum(_EARLIER not in trial.user_attrs for trial in known)
+        wanted = -own % self.config.batch if batch else self.config.batch  # of a batch that was begun, the rest
+        for k in range(min(wanted, self.n_trials - own)):
+            self.optuna_study.sampler = TPESampler(seed=self.seed + len(known) + k, multivariate=True)
+            batch.append(self.optuna_study.ask(self.space))
         return {self.first_number + trial.number: trial for trial in batch}
 
     def record(self, trial: Trial, objectives: Sequence[float], shortfall: float) -> None:

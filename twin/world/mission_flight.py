@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,11 @@ from twin.world.pace import FULL, Pace
 from twin.world.path_change import PathChange
 from twin.world.world import FastForward, World
 
-_UNCHANGED = PathChange(np.zeros(3), np.zeros(3), 0)
 _SAME_FACTOR = 0.01  # a factor of the pace that differs by less is set to the one that it approaches
+
+
+def _no_further_path(last: Reference, end: Point) -> tuple[Segment, ...]:
+    return ()
 
 
 class Flight:
@@ -27,6 +31,7 @@ class Flight:
 
     Args:
         fast_forward: simulates frames between keyframes quickly (`World.fast_forward`); None: every frame is returned.
+            A checkpoint leaves it out.
 
     Attributes:
         aligns: whether the network is aligned before the current frame is estimated: it is the first one of the second
@@ -39,11 +44,15 @@ class Flight:
 
     def __init__(self, mission: Mission, world: World, fast_forward: FastForward | None = None):
         self.mission, self.world = mission, world
-        self._fast_forward, self._parts = fast_forward, self._planned_parts()
-        self._mission, self._change = mission, _UNCHANGED  # with the heights that the path has now
+        self.fast_forward, self._n_parts = fast_forward, 0
+        self._mission = mission  # with the heights that the path has now
+        self._change, self._is_changed = PathChange(np.zeros(3), np.zeros(3), 0), False
         self.pace_factor = self._factor = 1.0
         self.aligns, self.n_skipped = False, 0
-        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = lambda *_: ()
+        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = _no_further_path
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"fast_forward": None}
 
     @property
     def track(self) -> int:
@@ -79,12 +88,15 @@ class Flight:
         left_m[2] = last.position[2] - new.position[2] - offset_m[2]
         rate_mps[2] = last.velocity[2] - sequence.rate * new.velocity[2]
         self._mission, self._change = mission, PathChange(left_m, rate_mps, now, offset_m)
+        self._is_changed = True
         self.world.end_sequence(self._k + 1)
         self._enter(self._mission.next_frames(sequence.track, path_time_s, FULL))
         self._k = -1
 
     def start(self) -> Frame:
-        self._enter(*next(self._parts))
+        part = self._next_part()
+        assert part is not None
+        self._enter(*part)
         return self._observe()
 
     def step(self, command: Array, pace: Pace = FULL, keyframe: bool | None = None) -> Frame | None:
@@ -106,14 +118,14 @@ class Flight:
         sequence, k = self._sequence, self._k + 1
         pace = pace if sequence.holding else self._slowed(pace)
         if sequence.holding or (pace == FULL and sequence.rate == 1):
-            self._k = k if self._fast_forward is None else self._fast_forward(sequence, k)
+            self._k = k if self.fast_forward is None else self.fast_forward(sequence, k)
             self.n_skipped = self._k - k
         else:
             self.world.end_sequence(k)
             self._enter(self._mission.next_frames(sequence.track, self._path_time_s, pace))
         self.aligns = False
         while self._k == len(self._sequence):
-            part = next(self._parts, None)
+            part = self._next_part()
             if part is None:
                 return None
             self._enter(*part)
@@ -129,22 +141,24 @@ class Flight:
         change_per_s = self._factor * pace.change_per_s + change_per_s * pace.rate
         return Pace(self._factor * pace.rate, change_per_s, pace.keyframe)
 
-    def _planned_parts(self) -> Iterator[tuple[FrameSequence, bool]]:
-        """Yields the planned sequences, each with the value of `aligns` at its first frame."""
-        for track in self.mission.tracks:
-            yield from self._parts_of(track)
-        while path := self.further_path(self.reference, end_of(self._mission.plan.paths[-1])):
-            plan = self._mission.plan
-            self._mission = replace(self._mission, plan=replace(plan, paths=(*plan.paths, path)))
-            yield from self._parts_of(self._mission.plan.n_tracks)
+    def _next_part(self) -> tuple[FrameSequence, bool] | None:
+        """Returns the next planned sequence, with the value of `aligns` at its first frame; None after the last one.
 
-    def _parts_of(self, track: int) -> Iterator[tuple[FrameSequence, bool]]:
-        yield self._mission.planned_frames(track), False
-        yield self._mission.station_keeping_frames(track), False
-        yield self._mission.station_keeping_frames(track, 1), True
+        The sequences of a track are its path and the two halves of the station keeping after it.
+        """
+        track, part = self._n_parts // 3 + 1, self._n_parts % 3
+        if track > self._mission.plan.n_tracks:
+            plan = self._mission.plan
+            if not (path := self.further_path(self.reference, end_of(plan.paths[-1]))):
+                return None
+            self._mission = replace(self._mission, plan=replace(plan, paths=(*plan.paths, path)))
+        self._n_parts += 1
+        if part == 0:
+            return self._mission.planned_frames(track), False
+        return self._mission.station_keeping_frames(track, part - 1), part == 2
 
     def _enter(self, sequence: FrameSequence, aligns: bool = False) -> None:
-        if self._change is not _UNCHANGED:
+        if self._is_changed:
             reference = self._change.added_to(
                 sequence.reference, len(self.world), self.mission.plan.request.frame_rate_hz
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -52,13 +53,14 @@ def make_pilot(mission: Mission, monitor: ThrusterMonitor | None = None) -> Pilo
 
 def _late(pilot: PilotOfEstimates, n: int) -> PilotOfEstimates:
     """Returns a pilot whose commands are those of n frames ago, at first zero."""
-    waiting: deque[Array] = deque()
+    return pilot if n == 0 else partial(_command_of_before, deque(), pilot, n)
 
-    def command(estimate: Estimate, reference: Reference) -> Array:
-        waiting.append(pilot(estimate, reference))
-        return waiting.popleft() if len(waiting) > n else np.zeros_like(waiting[0])
 
-    return pilot if n == 0 else command
+def _command_of_before(
+    waiting: deque[Array], pilot: PilotOfEstimates, n: int, estimate: Estimate, reference: Reference
+) -> Array:
+    waiting.append(pilot(estimate, reference))
+    return waiting.popleft() if len(waiting) > n else np.zeros_like(waiting[0])
 
 
 def without_feedback(estimate: Estimate, reference: Reference, readings: Readings) -> Estimate:
@@ -84,15 +86,16 @@ class PluginPilot:
     def __init__(self, mission: Mission, name: str):
         scenario, rig = mission.scenario, mission.rig
         nominal = nominal_controller(scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz)
-        n = scenario.vehicle.n_commands if scenario.vehicle.dynamics == "rigid" else 3
-        setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, n)
-        self._plugin = plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
-        self._command = _late(
-            lambda *known: plugin.numbers("command", plugin.call("command", *known), (n,)), frames_of_latency(scenario)
-        )
+        self._n = scenario.vehicle.n_commands if scenario.vehicle.dynamics == "rigid" else 3
+        setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, self._n)
+        self._plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
+        self._command = _late(self._of_plugin, frames_of_latency(scenario))
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
         return self._command(estimate, reference)
+
+    def _of_plugin(self, estimate: Estimate, reference: Reference) -> Array:
+        return self._plugin.numbers("command", self._plugin.call("command", estimate, reference), (self._n,))
 
     @property
     def adapts(self) -> bool:
@@ -110,12 +113,11 @@ class PluginPilot:
 
 
 def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
-    frequency = mission.scenario.control.natural_frequency_radps
+    return partial(_kinematic_command, mission.scenario.control.natural_frequency_radps)
 
-    def command(estimate: Estimate, reference: Reference) -> Array:
-        return commanded_velocity(estimate.world_from_camera[:3, 3], reference, frequency)
 
-    return command
+def _kinematic_command(frequency: float, estimate: Estimate, reference: Reference) -> Array:
+    return commanded_velocity(estimate.world_from_camera[:3, 3], reference, frequency)
 
 
 class PilotState(NamedTuple):

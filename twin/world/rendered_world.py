@@ -47,7 +47,8 @@ class RenderedWorld(World):
             if scenario.vehicle.dynamics == "rigid"
             else KinematicVehicle(mission.start_of_body)
         )
-        vehicle.touched = Obstacles(mission).touched
+        self._obstacles = Obstacles(mission)
+        vehicle.touched = self._obstacles.touched
         noise, believed = scenario.believed_noise(), mission.rig
         imu = None
         if scenario.imu is not None:
@@ -55,6 +56,7 @@ class RenderedWorld(World):
             vehicle.after_timestep = imu.add
         sensors = NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project, imu)
         super().__init__(mission, stopwatch, vehicle, sensors)
+        self._model = scene.model
         floor, objects = mission.rendered_terrain, mission.rendered_objects()
         self.renderer = Renderer(floor, rig.width_px, rig.height_px, rig.focal_px)
         self._image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
@@ -63,6 +65,11 @@ class RenderedWorld(World):
         self._surface = _overhanging_surface(mission, mission.grid)
         top_m = None if self._surface is None else self._surface.height_m
         self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m), top_m)
+
+    @property
+    def made_anew(self) -> tuple[object, ...]:
+        rendering = self.renderer, self._model, self._image_formation, self.camera.psf
+        return (*super().made_anew, *rendering, self._obstacles, self._surface)
 
     def true_floor(self) -> Terrain:
         floor, objects = self.mission.terrain, self.mission.objects

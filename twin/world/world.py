@@ -95,6 +95,12 @@ class World(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def made_anew(self) -> tuple[object, ...]:
+        """Returns objects that follow from the mission alone, in one order: a checkpoint of the world lacks them."""
+        floors = (one and one.floor for one in (self._altimeter, self._bottom_lock))
+        return (self.mission, *vars(self.mission).values(), *floors)
+
     @abstractmethod
     def close(self) -> None:
         """Releases the resources of the world."""

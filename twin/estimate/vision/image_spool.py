@@ -5,12 +5,16 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
+from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.checkpoint import check_hash
 from twin.core.records import Image
 from twin.estimate.vision import matching
 from twin.estimate.vision.disparity import Disparity
@@ -31,11 +35,25 @@ class ImageSpool:
 
     def __init__(self, folder: Path, binning: int = 1):
         self.folder, self.binning = folder, binning
+        self._hashes: dict[Path, str] = {}  # of the files written so far
         folder.mkdir(parents=True, exist_ok=True)
+        self._start()
+
+    def _start(self) -> None:
         self._writer = ThreadPoolExecutor(1)  # compresses in the background
         self._lock = threading.Lock()  # links are measured in other threads
         self._writing: Future[None] | None = None
         self._gray: OrderedDict[int, tuple[NDArray[np.float16], NDArray[np.float16]]] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.flush()
+        return {"folder": self.folder, "binning": self.binning, "_hashes": self._hashes}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        for file, expected in self._hashes.items():
+            check_hash(file, expected)
+        self._start()
 
     def put(
         self,
@@ -96,10 +114,16 @@ class ImageSpool:
 
     def _write(self, row: int, left: Image, right: Image, disparity: Disparity | None) -> None:
         for side, image in (("left", left), ("right", right)):
-            data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-            self._path(row, side).write_bytes(data.tobytes())
+            data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+            self._write_file(self._path(row, side), data)
         if disparity is not None:
-            np.save(self._path(row, "disparity", ".npy"), disparity.packed())
+            stream = BytesIO()
+            np.save(stream, disparity.packed())
+            self._write_file(self._path(row, "disparity", ".npy"), stream.getvalue())
+
+    def _write_file(self, file: Path, data: bytes) -> None:
+        file.write_bytes(data)
+        self._hashes[file] = sha256(data).hexdigest()
 
     def _path(self, row: int, side: str, suffix: str = ".png") -> Path:
         return self.folder / f"{row:06d}_{side}{suffix}"

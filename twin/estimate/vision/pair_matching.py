@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,13 @@ class PairMatcher:
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
         self.removed_yaw: dict[int, float] = {}
         self.twists: dict[int, Array] = {}
+        self._workers = ThreadPoolExecutor(2)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_workers": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
         self._workers = ThreadPoolExecutor(2)
 
     def close(self) -> None:

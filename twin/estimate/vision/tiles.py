@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,17 @@ class TiledRaster:
         self.n_layers, self.folder, self.max_tiles = n_layers, folder, max_tiles
         self._tiles: OrderedDict[tuple[int, int], Map] = OrderedDict()
         self._spooled: set[tuple[int, int]] = set()
+
+    def __getstate__(self) -> dict[str, Any]:
+        on_disk = [(key, np.load(self._path(key))) for key in sorted(self._spooled - self._tiles.keys())]
+        return vars(self) | {"_tiles": OrderedDict([*on_disk, *self._tiles.items()]), "_spooled": set()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        for stale in self.folder.glob("tile_*.npy"):
+            stale.unlink()
+        while len(self._tiles) > self.max_tiles:
+            self._spool(*self._tiles.popitem(last=False))
 
     def read(self, row: int, col: int, rows: int, cols: int) -> Map:
         """Returns a copy (n_layers, rows, cols) of the window whose first cell is (row, col). Raises OSError."""

@@ -1,0 +1,274 @@
+"""Checkpoints: a killed run goes on as if undisturbed, and what is damaged or of another run is refused."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kill_and_resume import differences, leftovers
+
+from twin import survey
+from twin.core import checkpoint
+from twin.core.checkpoint import FOLDER, Checkpoints
+from twin.core.series import GrowingArray
+from twin.errors import TwinError
+from twin.estimate.vision.image_spool import ImageSpool
+from twin.estimate.vision.tiles import TiledRaster
+from twin.scenario.file import input_files, load_scenario
+
+SMALL = [
+    "terrain.size_m=[5.0, 4.0]",
+    "rig.image_width_px=192",
+    "rig.image_height_px=144",
+    "rig.frame_rate_hz=15",
+    "plan.area_m=[0.8, 0.5]",
+    "plan.altitude_m=1.8",
+    "control.hold_s=0.4",
+]
+ALL_SENSORS = 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
+FAULTS = [
+    {"part": "left_camera", "type": "stuck", "start_s": 4.0, "duration_s": 1.0},
+    {"part": "pressure", "type": "stuck", "start_s": 2.0, "duration_s": 6.0},
+    {"part": "ahrs", "type": "delayed", "start_s": 2.0, "duration_s": 6.0, "size": 0.5},
+    {"part": "dvl", "type": "garbage", "start_s": 2.0, "duration_s": 6.0, "size": 0.1},
+    {"part": "thruster", "type": "stuck", "start_s": 3.5, "duration_s": 1.0, "number": 1},
+    {"part": "water", "type": "gust", "start_s": 2.0, "duration_s": 6.0, "size": 0.2},
+    {"part": "fish", "type": "school", "start_s": 2.0, "duration_s": 6.0, "size": 4},
+]
+
+
+class Killed(BaseException):
+    """Stands for the end of the process: nothing in the program handles it."""
+
+
+@pytest.fixture
+def run(tmp_path):
+    (tmp_path / "dem.tif").write_bytes(b"heights")
+    (tmp_path / "run").mkdir()
+
+    def checkpoints(interval_s=1e-9, **identity):
+        return Checkpoints(tmp_path / "run", {"scenario": "1a2b"} | identity, [tmp_path / "dem.tif"], interval_s)
+
+    return checkpoints
+
+
+def saved(run, state, made_anew=()):
+    checkpoints = run()
+    assert checkpoints.open(False, made_anew) is None
+    checkpoints.save_if_due(state)
+    assert checkpoints.problem == ""
+    return checkpoints
+
+
+def test_a_state_keeps_shared_objects_and_takes_others_from_the_program_and_the_folder(run, tmp_path):
+    rng, model = np.random.default_rng(1), object()
+    saved(run, {"a": rng, "b": [rng, model], "file": tmp_path / "run" / "keyframes" / "1.png"}, (None, model))
+    moved = tmp_path / "moved"
+    (tmp_path / "run").rename(moved)
+    fresh = object()
+    state = Checkpoints(moved, {"scenario": "1a2b"}, [tmp_path / "dem.tif"], 1.0).open(True, (None, fresh))
+    assert state["a"] is state["b"][0] and state["b"][1] is fresh
+    assert state["file"] == moved / "keyframes" / "1.png"
+    assert np.array_equal(state["a"].standard_normal(3), rng.standard_normal(3))
+
+
+def edit(file, old, new):
+    data = file.read_bytes()
+    assert old in data
+    file.write_bytes(data.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    "harm, identity, message",
+    [
+        (lambda f: edit(f / "state-1.pickle", b"flown", b"blown"), {}, "state-1.pickle: was edited or is damaged"),
+        (lambda f: os.truncate(f / "state-1.pickle", 20), {}, "state-1.pickle: was edited or is damaged"),
+        (lambda f: (f / "state-1.pickle").unlink(), {}, "state-1.pickle: is missing"),
+        (lambda f: os.truncate(f / "manifest.json", 50), {}, "manifest.json: is not JSON"),
+        (lambda f: edit(f / "manifest.json", b"checkpoint/1", b"checkpoint/0"), {}, "has not the schema"),
+        (lambda f: edit(f / "manifest.json", b'"sha256"', b'"sha1"'), {}, "manifest.json: names no state"),
+        (lambda f: None, {"scenario": "3c4d"}, "scenario: was 1a2b, is 3c4d"),
+        (lambda f: None, {"numpy": "2.4"}, "manifest.json: has other identity"),
+        (lambda f: edit(f.parent.parent / "dem.tif", b"heights", b"depths"), {}, "dem.tif has changed"),
+    ],
+)
+def test_a_damaged_or_foreign_checkpoint_is_refused_with_one_line(run, tmp_path, harm, identity, message):
+    saved(run, ["flown"])
+    harm(tmp_path / "run" / FOLDER)
+    with pytest.raises(TwinError) as error:
+        run(**identity).open(True)
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_folder_with_other_contents_and_no_checkpoint_is_refused_and_an_empty_one_begins(run, tmp_path):
+    assert run().open(True) is None
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    (tmp_path / "run" / FOLDER / "manifest.json").unlink()
+    with pytest.raises(TwinError, match="has no checkpoint"):
+        run().open(True)
+
+
+def test_an_interval_that_is_no_time_is_refused(run):
+    for wrong in (-1.0, np.nan):
+        with pytest.raises(TwinError, match="checkpoint_s: .* is no time between checkpoints"):
+            run(wrong)
+
+
+class Breaks:
+    def __init__(self, error):
+        self.error = error
+
+    def __getstate__(self):
+        raise self.error
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), TypeError("cannot pickle"), Killed()])
+def test_the_last_state_is_kept_if_the_next_one_fails_or_the_process_ends_within_it(run, tmp_path, error):
+    checkpoints = saved(run, ["whole"])
+    state = ["a" * 10_000_000, Breaks(error)]
+    if isinstance(error, Killed):
+        with pytest.raises(Killed):
+            checkpoints.save_if_due(state)
+        assert (tmp_path / "run" / FOLDER / "state-2.pickle.part").exists()
+    else:
+        checkpoints.save_if_due(state)
+        assert str(error) in checkpoints.problem
+    assert run().open(True) == ["whole"]
+    checkpoints.save_if_due(["later"])
+    assert run().open(True) == ["later"]
+    assert sorted(file.name for file in (tmp_path / "run" / FOLDER).iterdir()) == ["manifest.json", "state-2.pickle"]
+
+
+def test_checkpoints_are_a_minute_apart_or_take_a_hundredth_of_the_time(run, monkeypatch):
+    now_s = [0.0]
+    monkeypatch.setattr(checkpoint.time, "perf_counter", lambda: now_s[0])
+
+    checkpoints, times_s = run(None), []
+
+    class Slow:
+        def __reduce__(self):
+            times_s.append(now_s[0])
+            now_s[0] += 2.0
+            return list, ()
+
+    checkpoints.open(False)
+    while now_s[0] < 700:
+        checkpoints.save_if_due(Slow())
+        now_s[0] += 1.0
+    assert times_s == [60.0, 262.0, 464.0, 666.0]
+    run(0.0).save_if_due(Slow())
+    run(0.0).save_last(Slow())
+    assert len(times_s) == 4
+
+
+def test_restored_rows_tiles_and_images_go_on_as_the_saved_ones(tmp_path):
+    rows, tiles = GrowingArray(2), TiledRaster(1, tmp_path / "tiles", max_tiles=2)
+    rows.append(np.arange(6.0).reshape(3, 2))
+    for k in range(4):  # two of them are on the disk
+        tiles.write(0, 256 * k, np.full((1, 256, 256), k, np.float32))
+    data = pickle.dumps((rows, tiles))
+    tiles.write(0, 0, np.full((1, 256, 1024), 9, np.float32))  # after the checkpoint
+    again, restored = pickle.loads(data)
+    for one in (rows, again):
+        one.append([7.0, 8.0])
+    assert len(data) < 1.1 * 4 * 256 * 256 * 4
+    assert np.array_equal(again.array, rows.array)
+    assert np.array_equal(restored.read(0, 0, 1, 1024)[0, 0], np.repeat(np.arange(4), 256))
+    assert len(restored._tiles) <= 2
+
+
+def test_an_image_that_was_edited_after_the_checkpoint_is_refused(tmp_path):
+    spool, image = ImageSpool(tmp_path), np.zeros((8, 8, 3), np.uint8)
+    spool.put(3, image, image, (image[..., 0], image[..., 0]))
+    data = pickle.dumps(spool)
+    assert np.array_equal(pickle.loads(data).left(3), image)
+    (tmp_path / "000003_right.png").write_bytes(b"edited")
+    with pytest.raises(TwinError, match="000003_right.png: was edited or is damaged: the checkpoint depends on it"):
+        pickle.loads(data)
+
+
+def test_the_input_files_are_those_that_the_keys_of_the_scenario_name(tmp_path):
+    file = tmp_path / "model.toml"
+    scenario = load_scenario("reef", [f"imaging.error_model={file}"])
+    assert input_files(scenario) == [file] and input_files(load_scenario("reef")) == []
+
+
+VARIANTS = {
+    "faults": (ALL_SENSORS, f"faults=[{', '.join(json.dumps(one).replace(': ', '=') for one in FAULTS)}]"),
+    "altimeter": ("control.height=altimeter", ALL_SENSORS),
+    "gaps": ("control.height=map", "plan.fill_gaps=true", "record=all"),
+    "imu": ('navigation.aiding=["imu","dvl"]', "imu.rate_hz=60", "navigation.dvl_rate_hz=5", "record=all"),
+    "delays": (ALL_SENSORS, "navigation.usbl_delay_s=0.5", "navigation.pressure_delay_s=0.2", "control.latency=0.2"),
+    "sea": ("snow.density_per_m3=200", "current.gust_mps=0.05", "rig.model=machine_vision_dome"),
+    "kinematic": ("vehicle.dynamics=kinematic", "control.latency=0.2"),
+    "surrogate": ("imaging.fidelity=surrogate",),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_survey_that_was_killed_twice_ends_byte_identical(name, tmp_path):
+    overrides = [key.replace('"', "'") if key.startswith("faults") else key for key in VARIANTS[name]]
+    scenario = load_scenario("reef", [*SMALL, *overrides])
+    survey.run(scenario, tmp_path / "whole", outputs=())
+    n = len((tmp_path / "whole" / "trajectory_online.tum").read_text().splitlines())
+    for number, share in enumerate((0.3, 0.7, None)):
+
+        def progress(now, share=share):
+            if share is not None and now.stage == "survey" and now.simulated_s >= share * n / 15:
+                raise Killed
+
+        every_s = 1e-9 if name == "surrogate" else 0.2
+        try:
+            survey.run(scenario, tmp_path / "killed", progress, outputs=(), resume=number > 0, checkpoint_s=every_s)
+        except Killed:
+            manifest = json.loads((tmp_path / "killed" / FOLDER / "manifest.json").read_text())
+            assert manifest["state"] is not None
+    assert differences(tmp_path / "whole", tmp_path / "killed") == []
+    assert leftovers(tmp_path / "killed") == []
+
+
+KILL_AT_STAGE = """
+import os, signal, sys
+from pathlib import Path
+from twin import survey
+from twin.scenario.file import load_scenario
+
+def progress(now):
+    if now.stage == sys.argv[2]:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+survey.run(load_scenario("reef", sys.argv[3:]), Path(sys.argv[1]), progress, outputs=(), checkpoint_s=0.5)
+"""
+
+
+@pytest.mark.long
+def test_a_survey_killed_while_it_maps_or_reports_goes_on_after_the_flight(tmp_path):
+    scenario, flown = load_scenario("reef", SMALL), []
+    survey.run(scenario, tmp_path / "whole", outputs=())
+    for stage in ("map", "orthomosaic", "report"):
+        out = tmp_path / stage
+        command = [sys.executable, "-c", KILL_AT_STAGE, str(out), stage, *SMALL]
+        assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+
+        def progress(now):
+            flown.append(now.stage == "survey")
+
+        survey.run(scenario, out, progress, outputs=(), resume=True)
+        assert differences(tmp_path / "whole", out) == [] and leftovers(out) == []
+    assert flown and not any(flown)
+
+
+def test_a_finished_survey_of_another_scenario_is_not_resumed(tmp_path, monkeypatch):
+    class Finished:
+        metrics = {"scenario_hash": "0"}
+
+    monkeypatch.setattr(survey.RunResult, "of_folder", lambda _: Finished)
+    (tmp_path / "metrics.json").write_text("{}")
+    with pytest.raises(TwinError, match="has another survey, which is finished"):
+        survey.run(load_scenario("reef"), Path(tmp_path), resume=True)
