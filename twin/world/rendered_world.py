@@ -35,9 +35,10 @@ class RenderedWorld(World):
         scenario, cameras = mission.scenario, mission.true_cameras
         rig, rng = cameras.rendered_rig, streams(scenario.seed)
         timestep_s = physics_timestep_s(rig.frame_rate_hz, scenario.vehicle)
+        self._model = build(timestep_s, scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2)
         vehicle = (
             MujocoVehicle(
-                build(timestep_s, scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2),
+                self._model,
                 scenario.vehicle,
                 make_sea(scenario, rng["sea"]),
                 mission.start_of_body,
@@ -56,7 +57,6 @@ class RenderedWorld(World):
             vehicle.after_timestep = imu.add
         sensors = NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project, imu)
         super().__init__(mission, stopwatch, vehicle, sensors)
-        self._model = scene.model
         floor, objects = mission.rendered_terrain, mission.rendered_objects()
         self.renderer = Renderer(floor, rig.width_px, rig.height_px, rig.focal_px)
         self._image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
