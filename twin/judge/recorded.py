@@ -161,9 +161,9 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
 
 
 def _interpolated(truth: Trajectory) -> bool:
-    """Returns whether most steps between poses have the same rotation per displacement as the step before.
+    """Returns whether speeds vary, but most steps have the same rotation per displacement as the step before.
 
-    That is a screw motion, by which poses are interpolated; the motion of a real vehicle varies.
+    That is a screw motion, by which poses are interpolated; the rotation of a real vehicle varies with its speed.
     """
     poses = truth.world_from_camera[np.argsort(truth.times_s, kind="stable")]
     steps = [geometry.inverse(a) @ b for a, b in zip(poses[:-1], poses[1:], strict=True)]
@@ -172,7 +172,9 @@ def _interpolated(truth: Trajectory) -> bool:
     curvature = turns / np.maximum(lengths_m, 1e-9)[:, None]
     same = np.linalg.norm(np.diff(curvature, axis=0), axis=1) < _SAME_CURVATURE * np.linalg.norm(curvature[1:], axis=1)
     same &= np.linalg.norm(turns[1:], axis=1) > _LEAST_TURN_RAD
-    return len(same) >= _MIN_ASSOCIATED and float(np.mean(same)) > _LEAST_COVERED
+    if len(same) < _MIN_ASSOCIATED or np.std(lengths_m) <= _SAME_CURVATURE * np.mean(lengths_m):
+        return False
+    return float(np.mean(same)) > _LEAST_COVERED
 
 
 def _clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float, float] | None:
