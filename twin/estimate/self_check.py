@@ -15,6 +15,7 @@ import numpy as np
 from twin.core.quality import EstimationQuality, Finding
 from twin.core.records import ElevationMap, StereoRig, SurveyResult
 from twin.estimate.calibration_errors import SIGNIFICANT, contradicts, row_pattern
+from twin.estimate.vision.image_quality import MAX_REPETITION
 
 MAX_FRAMES_LOST = 0.02  # fraction of the frames
 MAX_LINKS_FAILED = 0.15  # fraction of the links
@@ -25,7 +26,6 @@ MAX_ROW_PATTERN_PX = 0.1  # systematic row difference that pitch, yaw, roll and 
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_DISPARITY_OFFSET_PX = 0.08  # offset of all disparities, estimated from the motions between keyframes
 MAX_SCALE_ERROR = 0.01  # relative difference of lengths from the images and from navigation sensors
-MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central peak
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
 ROW_PATTERN = "row_pattern"  #: name of the check of systematic row differences
