@@ -156,6 +156,24 @@ def test_errors_against_a_recorded_truth_are_judged_by_their_covariances():
     assert found["nees_position_mean"] == pytest.approx(expected)
 
 
+def test_a_truth_interpolated_along_a_screw_motion_is_named_and_does_not_judge_covariances():
+    """Poses between two true ones, at the speeds of the vehicle, as rounded in a file; those of the vehicle itself."""
+    rng, screw = np.random.default_rng(4), np.array([1e-4, -6e-4, -7e-4, -0.014, -0.028, 1.19])
+    at, wander = np.cumsum(1 + 0.01 * rng.normal(size=12)), rng.normal(size=(12, 6)) * [1e-3, 1e-3, 1e-3, 0, 0, 0]
+    times_s = np.arange(12) / 10
+    truth = Trajectory(times_s, np.array([geometry.exp(screw * s).round(7) for s in at]))
+    real = Trajectory(
+        times_s, np.array([geometry.exp(screw * s) @ geometry.exp(w) for s, w in zip(at, wander, strict=True)])
+    )
+    rows = np.arange(12)
+    result = SurveyResult(real, real, real, rows, rows, np.tile(np.eye(6) * 1e-6, (12, 1, 1)))
+    (warning,) = truth_warnings(real, truth)
+    assert "interpolated" in warning and recorded_consistency(result, truth, "first") == {}
+    assert (
+        truth_warnings(truth, real) == [] and recorded_consistency(result, real, "first")["nees_position_mean"] < 1e-9
+    )
+
+
 @pytest.mark.parametrize("offset_s", (1.0, -0.6))
 def test_a_truth_whose_clock_is_off_by_up_to_two_seconds_is_named(offset_s):
     times_s = np.arange(0, 30, 0.1)

@@ -32,6 +32,7 @@ class Link(NamedTuple):
     #: not known, as for motion that replaces a failed measurement.
     by_yaw: Array | None = None
     yaw_rad: float = 0.0  #: yaw for which the measured motion is already corrected
+    by_image_errors: Array | None = None  #: (6, 18) see `Motion`; None: not known
     #: fraction (0 to 1) of the variance that image noise does not explain: it is due to the relief within the matched
     #: patches, and correlated between links that use the same patches. `Links` does not store it.
     floor_share: float = 0.0
@@ -46,7 +47,7 @@ _LINK = np.dtype(
     [
         ("i", int), ("j", int), ("i_from_j", float, (4, 4)), ("information", float, (6, 6)), ("overlap", float),
         ("n_points", int), ("shared_by", float), ("closed_form", float, (4, 4)), ("by_yaw", float, (6,)),
-        ("yaw_rad", float),
+        ("yaw_rad", float), ("by_image_errors", np.float32, (6, 18)),
     ]
 )  # fmt: skip
 _NOT_COMPUTED = np.full((4, 4), np.nan)
@@ -86,12 +87,13 @@ class Links(Sequence[Link]):
     def __getitem__(self, k: int | slice) -> Link | list[Link]:
         if isinstance(k, slice):
             return [self[index] for index in range(*k.indices(len(self)))]
-        i, j, i_from_j, information, overlap, n_points, shared_by, form, by_yaw, yaw_rad = self._table[k]
+        i, j, i_from_j, information, overlap, n_points, shared_by, form, by_yaw, yaw_rad, by_image_errors = self._table[
+            k
+        ]
         numbers = float(overlap), int(n_points), float(shared_by)
         cov = symmetric_inverses(information[None])[0]
-        return Link(
-            int(i), int(j), i_from_j, cov, *numbers, None if np.isnan(form[0, 0]) else form, by_yaw, float(yaw_rad)
-        )
+        form = None if np.isnan(form[0, 0]) else form
+        return Link(int(i), int(j), i_from_j, cov, *numbers, form, by_yaw, float(yaw_rad), by_image_errors)
 
     @property
     def i(self) -> NDArray[np.int64]:
@@ -132,6 +134,11 @@ class Links(Sequence[Link]):
         return self._table["yaw_rad"]
 
     @property
+    def by_image_errors(self) -> NDArray[np.float32]:
+        """Returns `Link.by_image_errors` (n, 6, 18); zeros where it is not known."""
+        return self._table["by_image_errors"]
+
+    @property
     def n_points(self) -> NDArray[np.int64]:
         return self._table["n_points"]
 
@@ -146,13 +153,14 @@ class Links(Sequence[Link]):
     def _table(self) -> NDArray[Any]:
         if self._pending:
             pending, self._pending = self._pending, []
-            *columns, closed_forms, by_yaw, yaw_rad, _ = zip(*pending, strict=True)
+            *columns, closed_forms, by_yaw, yaw_rad, by_image_errors, _ = zip(*pending, strict=True)
             table = np.empty(len(pending), _LINK)
             for name, column in zip(_LINK.names or (), columns, strict=False):
                 table[name] = symmetric_inverses(np.array(column)) if name == "information" else column
             table["closed_form"] = [_NOT_COMPUTED if form is None else form for form in closed_forms]
             table["by_yaw"] = [np.zeros(6) if derivative is None else derivative for derivative in by_yaw]
             table["yaw_rad"] = yaw_rad
+            table["by_image_errors"] = [np.zeros((6, 18)) if one is None else one for one in by_image_errors]
             self._rows.append(table)
         return self._rows.array
 

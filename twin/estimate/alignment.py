@@ -59,6 +59,7 @@ def align(
     noise: SensorNoise,
     marginals_of: Sequence[int] | None = None,
     offset: DisparityOffset | None = None,
+    row_pattern: float = 0.0,
 ) -> AlignmentResult:
     """Returns the maximum-likelihood poses of a window of nodes, their covariances, and the links removed as outliers.
 
@@ -68,13 +69,14 @@ def align(
             prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
         offset: offset of all disparities, measured by the links; used if the calibration states that it may have one.
+        row_pattern: RMS of a systematic row difference between the cameras [focal lengths]; 0: none.
 
     Raises:
         LinAlgError: the links, anchors and sensor readings do not constrain every node.
     """
     links, dropped = Links.from_sequence(links), list[Link]()
     displacements = [kind for kind in [aiding.displacement_factors(nodes, rig)] if len(kind.i)]
-    shared = shared_parameters(rig, noise, bool(displacements), offset)
+    shared = shared_parameters(rig, noise, bool(displacements), offset, row_pattern)
     unary = [_anchor_factors(nodes, anchors), *aiding.unary_factors(nodes, rig, noise)]
     graph = FactorGraph(len(nodes), unary, [_motion_factors(nodes, links, shared), *displacements], shared.prior)
     start = GraphState(np.array([node.world_from_camera for node in nodes]), shared.prior.mean)

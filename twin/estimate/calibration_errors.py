@@ -18,7 +18,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import DisparityOffset, LengthScale, YawEffect
+from twin.core.quality import CalibrationEstimate, DisparityOffset, EpipolarError, LengthScale, YawEffect
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.link_selection import RECURRENCE
 from twin.estimate.navigation.dvl import body_displacement
@@ -27,6 +27,7 @@ from twin.estimate.vision.stereo import Keyframe
 #: Largest median standard deviation of the offset from a single link at which the offset counts as observable [px].
 MAX_LINK_SIGMA_PX = 0.3
 _MOST_SIGMA = 0.1  # a scale with a larger standard deviation is not observed
+SIGNIFICANT = 4.0  #: standard deviations
 _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many times that of all sensors together
 
 
@@ -50,6 +51,25 @@ def disparity_offset(
     shared_by = max(len(offsets) / n_nodes, 1.0) * (1 + RECURRENCE * (n_views - 1))
     variance = max(chi2, 1.0) * shared_by / float(np.sum(weight))
     return DisparityOffset(mean, variance**0.5)
+
+
+def row_pattern(
+    epipolar: EpipolarError, calibration: CalibrationEstimate, offset: DisparityOffset | None, rig: StereoRig
+) -> float:
+    """Returns the RMS of the systematic row difference that no rotation of a camera explains [focal lengths].
+
+    A yaw by the rows that the motions exclude (`contradicts`) is a distortion.
+    """
+    yaw_rad = float(epipolar.estimate[1]) - calibration.yaw_rad
+    if not contradicts(offset, yaw_rad):
+        return epipolar.pattern
+    corner = np.array([rig.width_px, rig.height_px]) / 2 / rig.focal_px
+    return float(np.hypot(epipolar.pattern, yaw_rad * np.prod(corner) / 3))  # RMS of yaw x y over the image
+
+
+def contradicts(offset: DisparityOffset | None, yaw_rad: float) -> bool:
+    """Returns whether the motions of near and far points exclude the offset of disparities that a yaw causes."""
+    return offset is not None and abs(offset.estimate) + SIGNIFICANT * offset.sigma < abs(yaw_rad)
 
 
 def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> float:

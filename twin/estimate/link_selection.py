@@ -99,7 +99,8 @@ def _spread(others: list[int], earlier: Sequence[Keyframe]) -> list[int]:
 def to_link(node: Keyframe, other: Keyframe, overlap: float, motion: Motion) -> Link:
     ends, share = (other.number, node.number), floor_share(motion)
     yaw = (None, 0.0) if motion.yaw is None else (motion.yaw.by_yaw, motion.yaw.removed_rad)
-    return Link(*ends, motion.a_from_b, motion.cov, overlap, motion.n_points, 1.0, motion.closed_form, *yaw, share)
+    form, errors = motion.closed_form, motion.by_image_errors
+    return Link(*ends, motion.a_from_b, motion.cov, overlap, motion.n_points, 1.0, form, *yaw, errors, share)
 
 
 def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:

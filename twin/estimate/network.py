@@ -21,7 +21,9 @@ from twin.core.timing import StageTimer
 from twin.errors import SurveyAborted
 from twin.estimate import calibration_errors, link_selection
 from twin.estimate.alignment import AlignmentResult, align
+from twin.estimate.calibration_errors import row_pattern
 from twin.estimate.self_calibration import fused
+from twin.estimate.vision.epipolar_calibration import NOTICEABLE_PX
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision_interface import Vision
 
@@ -271,6 +273,20 @@ class KeyframeNetwork:
         n_views = calibration_errors.mean_views(poses, depth_m, self.rig)
         return calibration_errors.disparity_offset(offsets, n_nodes, n_views, self.rig.focal_px)
 
+    def offset_by_motions(self) -> DisparityOffset | None:
+        """Returns the offset of all disparities by the links; None where they are corrected for the yaw instead."""
+        if self.rig.yaw_sigma_rad:
+            return None
+        return self.disparity_offset(self.history.disparity_offsets, len(self.nodes) - 1)
+
+    def _row_pattern(self) -> float:
+        """Returns the RMS of the systematic row difference so far [focal lengths]; 0 if it is not noticeable."""
+        epipolar = self.vision.epipolar_error()
+        if epipolar is None:
+            return 0.0
+        pattern = row_pattern(epipolar, self.history.calibration, self.offset_by_motions(), self.rig)
+        return pattern if pattern * self.rig.focal_px > NOTICEABLE_PX else 0.0
+
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
         """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
 
@@ -285,8 +301,9 @@ class KeyframeNetwork:
         anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: self.reference_cov}
         start_s = time.perf_counter()
         yaw = self.disparity_offset(self.history.yaws, len(self.nodes) - 1) if self.rig.yaw_sigma_rad else None
+        pattern = self._row_pattern()
         try:
-            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, yaw)
+            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, yaw, pattern)
         except np.linalg.LinAlgError as error:
             self._alignable = False
             raise SurveyAborted(f"global alignment failed: {error}") from None

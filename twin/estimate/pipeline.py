@@ -407,9 +407,6 @@ class Navigator:
         history, nodes = self.network.history, self.network.nodes
         residuals, alignments = np.array(history.link_residuals), history.alignments
         failed, counts = np.isnan(residuals), self.filter.gates.counts
-        offset = (
-            None if self.rig.yaw_sigma_rad else self.network.disparity_offset(history.disparity_offsets, len(nodes) - 1)
-        )
         across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
         return EstimationQuality(
             frames_lost=self.log.n_lost,
@@ -422,7 +419,7 @@ class Navigator:
             alignment_converged=not alignments or alignments[-1].converged,
             epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
-            disparity_offset=offset,
+            disparity_offset=self.network.offset_by_motions(),
             calibration=history.calibration,
             independent_errors=history.independent_errors,
             length_scale=across,

@@ -5,6 +5,9 @@ cameras and the error of the baseline since the calibration. A yaw adds (1 + x^2
 column x, which images that overlap contradict, over relief more than over a level floor; the baseline is observable
 by navigation sensors only. What is not observable remains as uncertain as the calibration states, in the covariances of
 all poses.
+
+So do errors of image positions that a wrong lens or port leaves (`image_errors`), if row differences show that there
+are any.
 """
 
 from __future__ import annotations
@@ -19,15 +22,17 @@ from twin.core.links import Links
 from twin.core.quality import CalibrationEstimate, DisparityOffset
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.adjustment.pose_graph import Effect, SharedPrior, Solution
+from twin.estimate.vision.image_errors import coefficient_sigmas
 
 DVL, YAW, BASELINE = "dvl", "yaw", "baseline"
 
 
 class SharedParameters(NamedTuple):
-    """Names of the k shared parameters, in the order of the columns, and their prior."""
+    """Shared parameters: named ones, and after them the coefficients of `image_errors` if there are any errors."""
 
-    names: Sequence[str]
+    names: Sequence[str]  #: in the order of the columns
     prior: SharedPrior
+    image_errors: bool = False
 
     def effect_on(self, links: Links) -> Effect | None:
         """Returns the effect of the parameters on measured motions; None if there is none.
@@ -35,11 +40,13 @@ class SharedParameters(NamedTuple):
         A longer baseline makes all lengths longer: those of the adjusted motions, as with the measured ones, a shorter
         baseline would reduce the residuals.
         """
-        if YAW not in self.names and BASELINE not in self.names:
+        if YAW not in self.names and BASELINE not in self.names and not self.image_errors:
             return None
 
         def effect(i_from_j: Array, batch: slice) -> tuple[Array, Array]:
-            derivatives, at = (np.zeros((len(i_from_j), *shape, len(self.names))) for shape in ((6,), ()))
+            derivatives, at = (np.zeros((len(i_from_j), *shape, len(self.prior.mean))) for shape in ((6,), ()))
+            if self.image_errors:
+                derivatives[:, :, len(self.names) :] = links.by_image_errors[batch]
             if YAW in self.names:
                 k = self.names.index(YAW)
                 derivatives[:, :, k], at[:, k] = links.by_yaw[batch], links.yaw_rad[batch]
@@ -61,16 +68,21 @@ class SharedParameters(NamedTuple):
 
 
 def shared_parameters(
-    rig: StereoRig, noise: SensorNoise, with_dvl: bool, offset: DisparityOffset | None
+    rig: StereoRig, noise: SensorNoise, with_dvl: bool, offset: DisparityOffset | None, row_pattern: float
 ) -> SharedParameters:
-    """Returns the parameters to estimate; `offset` is that of the links, None where it is not observable."""
+    """Returns the parameters to estimate; `offset` is that of the links, None where it is not observable.
+
+    `row_pattern` is the RMS of a systematic row difference [focal lengths], 0 if there is none.
+    """
     rows = [(DVL, 0.0, noise.dvl_scale)] if with_dvl else []
     if rig.yaw_sigma_rad > 0:
         rows.append((YAW, *fused(rig.yaw_sigma_rad, offset)))
     if rig.baseline_sigma > 0:
         rows.append((BASELINE, 0.0, rig.baseline_sigma))
     names, mean, sigma = zip(*rows, strict=True) if rows else ((), (), ())
-    return SharedParameters(names, SharedPrior(np.array(mean, np.float64), np.array(sigma, np.float64)))
+    errors = coefficient_sigmas(row_pattern) if row_pattern else np.zeros(0)
+    prior = SharedPrior(np.append(np.array(mean, np.float64), 0 * errors), np.append(sigma, errors))
+    return SharedParameters(names, prior, bool(len(errors)))
 
 
 def fused(sigma: float, offset: DisparityOffset | None) -> tuple[float, float]:

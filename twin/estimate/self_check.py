@@ -12,8 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.core.quality import DisparityOffset, EstimationQuality, Finding
+from twin.core.quality import EstimationQuality, Finding
 from twin.core.records import ElevationMap, StereoRig, SurveyResult
+from twin.estimate.calibration_errors import SIGNIFICANT, contradicts, row_pattern
+from twin.estimate.vision.image_quality import MAX_REPETITION
 
 MAX_FRAMES_LOST = 0.02  # fraction of the frames
 MAX_LINKS_FAILED = 0.15  # fraction of the links
@@ -24,10 +26,9 @@ MAX_ROW_PATTERN_PX = 0.1  # systematic row difference that pitch, yaw, roll and 
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_DISPARITY_OFFSET_PX = 0.08  # offset of all disparities, estimated from the motions between keyframes
 MAX_SCALE_ERROR = 0.01  # relative difference of lengths from the images and from navigation sensors
-MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central peak
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
-_SIGNIFICANT = 4.0  # standard deviations
+ROW_PATTERN = "row_pattern"  #: name of the check of systematic row differences
 _COVERED = 3.0  # largest effect of a calibration error that the standard deviation of a result covers [its sigmas]
 
 
@@ -44,15 +45,19 @@ def with_length_error(
     """Returns the results with covariances that include the errors of all lengths which the findings imply.
 
     With a relative error s, a position at a distance d from the first keyframe is off by s d along d, and a height by s
-    times the depth of the floor. Unchanged if no finding implies such an error.
+    times the depth of the floor. Unchanged if no finding implies such an error. The alignment has already taken account
+    of the effect of a row pattern on positions (`image_errors`).
     """
-    share = float(np.sqrt(sum(finding.length_error**2 for finding in findings)))
+    share, of_positions = (
+        float(np.sqrt(sum(finding.length_error**2 for finding in findings if finding.check not in known)))
+        for known in ((), (ROW_PATTERN,))
+    )
     rows = result.keyframe_rows[: len(result.node_cov)]
     if not share or not len(rows):
         return result, elevation
     poses, cov = result.final.world_from_camera[rows], result.node_cov.copy()
     offsets_m = np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3] - poses[0, :3, 3])  # in camera axes
-    cov[:, 3:, 3:] += share**2 * offsets_m[:, :, None] * offsets_m[:, None, :]
+    cov[:, 3:, 3:] += of_positions**2 * offsets_m[:, :, None] * offsets_m[:, None, :]
     if elevation is not None:
         depth_m = np.float32(share * np.median(result.keyframe_depth_m))
         elevation = replace(elevation, sigma_m=np.hypot(elevation.sigma_m, depth_m))
@@ -148,11 +153,8 @@ def _rectification(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
     if epipolar is None:
         return
     yaw, sigma = float(epipolar.estimate[1]) - result.quality.calibration.yaw_rad, float(epipolar.sigma[1])
-    pattern = epipolar.pattern
-    if _contradicted(yaw, result.quality.disparity_offset):
-        corner = np.array([damage.rig.width_px, damage.rig.height_px]) / 2 / damage.rig.focal_px
-        pattern = float(np.hypot(pattern, yaw * np.prod(corner) / 3))  # RMS of yaw x y over the image
-    elif abs(yaw) > _SIGNIFICANT * sigma:
+    offset = result.quality.disparity_offset
+    if not contradicts(offset, yaw) and abs(yaw) > SIGNIFICANT * sigma:
         text = (
             f"row differences imply a yaw of {np.rad2deg(yaw):+.3f} deg between the cameras, or a distortion error:"
             f" disparities may be off by {abs(yaw) * focal_px:.1f} px"
@@ -160,16 +162,12 @@ def _rectification(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
         # an estimator that does not calibrate itself is left with the yaw that the calibration leads to expect
         expected_px = 0.0 if result.quality.calibration.cov.any() else _COVERED * damage.rig.yaw_sigma_rad * focal_px
         yield from damage.check("yaw", yaw, max(MAX_YAW_PX, expected_px), text)
+    pattern = row_pattern(epipolar, result.quality.calibration, offset, damage.rig)
     text = (
         f"row differences of stereo matches vary systematically over the image by {pattern * focal_px:.2f} px,"
         " which no rotation of a camera explains: the distortion or the port is not as calibrated"
     )
-    yield from damage.check("row_pattern", pattern, MAX_ROW_PATTERN_PX, text)
-
-
-def _contradicted(yaw_rad: float, offset: DisparityOffset | None) -> bool:
-    """Returns whether the motions of near and far points exclude the offset of disparities that a yaw causes."""
-    return offset is not None and abs(offset.estimate) + _SIGNIFICANT * offset.sigma < abs(yaw_rad)
+    yield from damage.check(ROW_PATTERN, pattern, MAX_ROW_PATTERN_PX, text)
 
 
 def _consistency(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
@@ -177,7 +175,7 @@ def _consistency(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
     text = f"residuals of points matched between keyframes are {residual or 0:.1f} times their noise"
     yield from _above("link_residual", residual, MAX_LINK_RESIDUAL, text)
     offset = quality.disparity_offset
-    if offset is not None and abs(offset.estimate) > _SIGNIFICANT * offset.sigma:
+    if offset is not None and abs(offset.estimate) > SIGNIFICANT * offset.sigma:
         text = (
             "the motions of near and far points imply that all disparities are off by "
             f"{offset.estimate * damage.rig.focal_px:+.2f} px: a principal point or the yaw of a camera is not as"
@@ -210,7 +208,7 @@ def _scale(quality: EstimationQuality) -> list[Finding]:
         ("length_scale", quality.length_scale, "", "the baseline or the scale of the sensors"),
         ("depth_scale", quality.depth_scale, " along the optical axis", "the baseline or the focal length"),
     ):
-        if scale is not None and abs(scale.estimate - 1) > max(MAX_SCALE_ERROR, _SIGNIFICANT * scale.sigma):
+        if scale is not None and abs(scale.estimate - 1) > max(MAX_SCALE_ERROR, SIGNIFICANT * scale.sigma):
             ratio = f"{scale.estimate:.3f} +- {scale.sigma:.3f} times those of {scale.sensors}"
             text = f"the lengths{which} from the images are {ratio}: {cause} is not as calibrated"
             return [Finding(check, abs(scale.estimate - 1), MAX_SCALE_ERROR, text)]

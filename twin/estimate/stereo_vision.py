@@ -31,7 +31,7 @@ from twin.estimate.vision import disparity, epipolar_calibration, matching, ster
 from twin.estimate.vision.disparity import DenseMatch
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
-from twin.estimate.vision.image_quality import contrast, repetition, saturated_fraction
+from twin.estimate.vision.image_quality import MAX_REPETITION, contrast, repetition, saturated_fraction
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.light_pattern import light_pattern, pattern_coefficients, pattern_difference, pattern_fit
 from twin.estimate.vision.mosaic import Mosaic, Registration, can_represent, viewing_plane
@@ -81,6 +81,7 @@ class StereoVision:
         self.calibration = EpipolarCalibration()
         self._configure(binning=1)
         self.stereo_observations: list[StereoObservation] = []
+        self._repetition: dict[int, float] = {}  # of the images of keyframes, by frame index
         self._depth_of_keyframe: dict[int, NDArray[np.float16]] = {}
         self._points: StereoPoints | None = None
 
@@ -179,7 +180,7 @@ class StereoVision:
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
         """Returns the quality of a stereo pair; row differences are in pixels of the full image with square pixels."""
         seen = contrast(self._gray), saturated_fraction(left)
-        repeated = repetition(self._image, self.settings.patch_px)
+        repeated = self._repetition[row] = repetition(self._image, self.settings.patch_px)
         if not len(points.xyz):
             return StereoObservation(row, 0, *seen, repetition=repeated)
         sigma_px = float(np.median(epipolar_calibration.row_sigma(points))) * self.rig.focal_px / points.noise_ratio
@@ -236,12 +237,13 @@ class StereoVision:
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
         """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured.
 
-        Without `settings.wide_search`, only where the predicted poses are too uncertain for matching, and rejected if
-        it contradicts them. None if not tried, failed or rejected.
+        Without `settings.wide_search`, or if the texture repeats, only where the predicted poses are too uncertain for
+        matching, and rejected if it contradicts them. None if not tried, failed or rejected.
         """
         if node.points is None or not len(node.points.xyz):
             return None
-        predicted_cov, anywhere = node.motion_cov(other), self.settings.wide_search
+        ambiguous = max(self._repetition[key.row] for key in (node, other)) > MAX_REPETITION
+        predicted_cov, anywhere = node.motion_cov(other), self.settings.wide_search and not ambiguous
         if not (anywhere or wide_search.may_exceed(SEARCH_PX, node.points, predicted_cov, self.rig)):
             return None
         with self.stopwatch("flow"):

@@ -30,6 +30,8 @@ _BLOCKS = 4  # parts of the path, left out one at a time for the standard deviat
 _LEAST_COVERED = 0.5  # of the frames, which have a true pose, without a warning
 _MOST_OFFSET_S, _OFFSET_STEP_S = 2.0, 0.05  # of the clock of the truth that is searched for, and steps of the search
 _CLEARLY = 0.3
+_SAME_CURVATURE = 1e-3  # relative difference of rotation / displacement of two steps of one screw motion
+_LEAST_TURN_RAD = 1e-5  # of a step whose curvature is compared
 _MOST_STEPS = 20
 _CONVERGED_M = 1e-5
 _LEAST_COSINE = 0.7  # of the angle between the axes of height; a map of a wall is not compared with a height grid
@@ -99,10 +101,13 @@ def recorded_consistency(result: SurveyResult, truth: Trajectory, alignment: Ali
     """Returns `consistency.*` of the positions of the keyframes that have a true pose.
 
     Errors are those after the alignment: without the keyframe at which it was done for "first", and smaller than
-    before for "se3", as it takes a part of them. Errors of the truth count as errors of the estimate.
+    before for "se3", as it takes a part of them. Errors of the truth count as errors of the estimate; empty if it is
+    interpolated.
     """
     n, final = min(len(result.keyframe_rows), len(result.node_cov)), result.final
     rows = associate(final.times_s, truth.times_s)
+    if _interpolated(truth):
+        return {}
     used = np.flatnonzero(np.isin(result.keyframe_rows[:n], rows.estimate))
     used = used[1:] if alignment == "first" else used
     frames, order = result.keyframe_rows[used], np.argsort(rows.estimate)
@@ -147,7 +152,29 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
             f"The axes of the truth are turned by {angle_deg:.0f} degrees (sigma {sigma_deg:.0f}) from those of the "
             "left camera: the truth seems to be that of another body."
         )
+    if _interpolated(b):
+        found.append(
+            "The true poses lie on the same screw motion for most of the frames: they seem to be interpolated, so the"
+            " errors of attitude and across the path, and the covariances, cannot be judged by them."
+        )
     return found
+
+
+def _interpolated(truth: Trajectory) -> bool:
+    """Returns whether speeds vary, but most steps have the same rotation per displacement as the step before.
+
+    That is a screw motion, by which poses are interpolated; the rotation of a real vehicle varies with its speed.
+    """
+    poses = truth.world_from_camera[np.argsort(truth.times_s, kind="stable")]
+    steps = [geometry.inverse(a) @ b for a, b in zip(poses[:-1], poses[1:], strict=True)]
+    turns = np.array([geometry.so3_log(step[:3, :3]) for step in steps]).reshape(-1, 3)
+    lengths_m = np.array([np.linalg.norm(step[:3, 3]) for step in steps])
+    curvature = turns / np.maximum(lengths_m, 1e-9)[:, None]
+    same = np.linalg.norm(np.diff(curvature, axis=0), axis=1) < _SAME_CURVATURE * np.linalg.norm(curvature[1:], axis=1)
+    same &= np.linalg.norm(turns[1:], axis=1) > _LEAST_TURN_RAD
+    if len(same) < _MIN_ASSOCIATED or np.std(lengths_m) <= _SAME_CURVATURE * np.mean(lengths_m):
+        return False
+    return float(np.mean(same)) > _LEAST_COVERED
 
 
 def _clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float, float] | None:

@@ -10,6 +10,7 @@ import numpy as np
 from twin.core.geometry import Array
 from twin.estimate.vision.matching import Gray, Image, local_moments
 
+MAX_REPETITION = 0.6  #: highest autocorrelation (`repetition`) of images whose matches are unambiguous
 _FULL_SCALE = 255  # grey level of a saturated pixel
 _SMALLEST_WEIGHT = 0.2  # shifts with a smaller overlap of the tapers, relative to zero shift, are ignored
 

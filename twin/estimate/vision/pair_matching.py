@@ -125,6 +125,7 @@ class PairMatcher:
             common_sigma=COMMON_BIAS_PX / self.rig.focal_px,
             variance_inflation=matching.variance_inflation(measured.b[:, :2] * self.rig.focal_px, self.patch_px),
             locking=matched.locking,
+            half_size=np.array([self.rig.width_px, self.rig.height_px]) / (2 * self.rig.focal_px),
         )
         guess = predicted if closed_form is None else closed_form
         motion = two_view_motion.pair_motion(measured, self.rig.baseline_m, guess, settings)

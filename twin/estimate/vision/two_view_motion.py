@@ -13,6 +13,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import DisparityOffset, YawEffect
+from twin.estimate.vision.image_errors import image_errors
 from twin.estimate.vision.observation_equations import (
     LinearisedObservations,
     PairMeasurements,
@@ -52,6 +53,8 @@ class Motion(NamedTuple):
     closed_form: Array | None = None  #: (4, 4) motion by eq. 2 from which the estimation started, if it did
     disparity_offset: DisparityOffset | None = None  #: offset of all disparities, if it is estimated (`pair_motion`)
     yaw: YawEffect | None = None  #: yaw between the cameras, as `disparity_offset`
+    #: (6, 18) correction of the motion by the coefficients of `image_errors` (rad, m), as `yaw.by_yaw`.
+    by_image_errors: Array | None = None
 
 
 class PairMotionSettings(NamedTuple):
@@ -63,6 +66,7 @@ class PairMotionSettings(NamedTuple):
     n_measured: int = 3  #: coordinates measured in pair a: 3, or 2 if its disparity is unknown, of large variance
     #: with this, the amplitude of pixel locking is estimated together with the motion.
     locking: PixelLocking | None = None
+    half_size: Array | None = None  #: that of `image_errors`; with it, their effect is computed
 
 
 _DEFAULT_SETTINGS = PairMotionSettings()
@@ -157,7 +161,11 @@ def _adjust_pair(
     motion = Motion(a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale)
     if settings.n_measured < 3:
         return motion
-    return motion._replace(disparity_offset=_disparity_offset(normals, settings), yaw=_yaw(normals, measured, settings))
+    return motion._replace(
+        disparity_offset=_disparity_offset(normals, settings),
+        yaw=_yaw(normals, measured, settings),
+        by_image_errors=_by_image_errors(normals, measured, settings),
+    )
 
 
 class _WeightedNormals(NamedTuple):
@@ -227,6 +235,18 @@ def _yaw(normals: _WeightedNormals, measured: PairMeasurements, settings: PairMo
     moved = np.einsum("nij,nj->ni", normals.observations.jacobian_point, change_by_yaw(measured.b))
     found = _additional_unknown(normals, change_by_yaw(measured.a) - moved, settings)
     return None if found is None else YawEffect(*found)
+
+
+def _by_image_errors(
+    normals: _WeightedNormals, measured: PairMeasurements, settings: PairMotionSettings
+) -> Array | None:
+    if settings.half_size is None:
+        return None
+    observations = normals.observations
+    a, b = (image_errors(points, settings.half_size) for points in (measured.a, measured.b))
+    weighted = normals.weight[:, None, None] * (observations.information @ (a - observations.jacobian_point @ b))
+    coupling = np.einsum("nrp,nrk->pk", observations.jacobian_motion, weighted)
+    return -np.linalg.solve(normals.normal, coupling)[:6]
 
 
 def _additional_unknown(
