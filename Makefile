@@ -3,7 +3,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PARALLEL := -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: env demo test long slow docs agreement
+.PHONY: env demo test long slow bench docs agreement
 
 env: $(READY) ## set up: a virtual environment with exact versions
 
@@ -29,6 +29,9 @@ long: env ## small surveys, their reports and Monte Carlo references: tests of s
 
 slow: env ## whole surveys and benchmarks
 	$(BIN)/python -m pytest -m slow
+
+bench: env ## the cost of every stage as a ratio to its floor, compared with tests/benchmarks.toml
+	$(BIN)/twin bench --against tests/benchmarks.toml --out runs/bench.png
 
 docs: env ## the documentation as a site, in site/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

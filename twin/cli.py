@@ -11,7 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -89,7 +89,7 @@ def main() -> None:
     console.open_closed_streams()
     console.accept_any_text()
     console.hide_log_failures()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `one_blas_thread`; read when numpy is imported, after this
+    _set_up_openblas()
     with sigterm_as_interrupt():
         try:
             with console.machine_errors():
@@ -97,6 +97,17 @@ def main() -> None:
         except TwinError as error:
             console.print_error(str(error))
             sys.exit(2)
+
+
+def _set_up_openblas() -> None:
+    """Sets one thread (`one_blas_thread`) and, if the processor has AVX2, its kernels: others round differently.
+
+    OpenBLAS reads both when numpy is imported, which must be after this.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with suppress(OSError):  # not Linux
+        if {"avx2", "fma"} <= set(Path("/proc/cpuinfo").read_text().split()):
+            os.environ["OPENBLAS_CORETYPE"] = "Haswell"
 
 
 @app.command()
@@ -567,6 +578,28 @@ def export(
         print(f"Warning: {warning}", file=sys.stderr)
     for name, paths in written.items():
         print(f"{name}: {', '.join(map(str, paths))}")
+
+
+@app.command()
+def bench(
+    full: Annotated[bool, option("Also larger images, four scenes and memory.", flag="--full")] = False,
+    against: Annotated[Path | None, option("Accepted values (TOML): status 1 if one is exceeded.", "FILE")] = None,
+    out: Annotated[Path | None, option("PNG to write, with a bar for each ratio.")] = None,
+    as_json: Annotated[bool, option("Print only the rows, as JSON.", flag="--json")] = False,
+) -> None:
+    """Measure the cost of each stage as a ratio to that of the best library call or limit, side by side."""
+    _require_rendering()
+    from twin.bench import report as benchmark
+
+    accepted, file = against and benchmark.read_accepted(against), out and outputs.output_file(out)
+    with console.replay_bar() as progress:
+        rows = benchmark.measure(full, progress)
+    problems = accepted.problems(rows) if accepted else []
+    if file is not None:
+        with outputs.writing(file):
+            benchmark.draw(rows, file)
+    _show(as_json, benchmark.as_json(rows, problems), [("Benchmark", benchmark.table(rows))], "\n".join(problems))
+    raise typer.Exit(1 if problems else 0)
 
 
 @app.command()

@@ -17,18 +17,19 @@ STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "networ
 
 
 class Stopwatch:
-    """Stopwatch that collects the durations of named stages: `with watch("f2f"): ...`."""
+    """Stopwatch that collects the durations of named stages: `with watch("f2f"): ...`; `now` is its clock [s]."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
         self._durations_s: dict[str, list[float]] = defaultdict(list)
+        self._now = now
 
     @contextmanager
     def __call__(self, stage: str) -> Generator[None]:
-        start = time.perf_counter()
+        start = self._now()
         try:
             yield
         finally:
-            self._durations_s[stage].append(time.perf_counter() - start)
+            self._durations_s[stage].append(self._now() - start)
 
     def durations_ms(self, stage: str) -> list[float]:
         return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, [])]

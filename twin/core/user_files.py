@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import re
 import warnings
@@ -14,8 +15,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from twin.errors import TwinError, described
 
@@ -186,7 +185,7 @@ def _check_contents(source: rasterio.DatasetReader) -> None:
         _MOST_TILE_PX, source.width * source.height
     ):
         raise ValueError(f"its tiles of {source.block_shapes[0]} pixels are larger than the raster")
-    if not np.isfinite(source.transform[:6]).all():
+    if not all(map(math.isfinite, source.transform[:6])):
         raise ValueError("its coordinates are not finite")
 
 

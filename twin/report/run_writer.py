@@ -13,8 +13,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_info
 
 from twin.core import geometry
 from twin.core.checkpoint import flushed_length, reopened
@@ -260,7 +262,10 @@ def _error_m(elevation: ElevationMap, truth: Truth) -> NDArray[np.float32]:
 
 @cache
 def environment() -> dict[str, str]:
-    """Returns the contents of env.json: versions of this program, Python and the main packages, and the machine."""
+    """Returns the contents of env.json: versions of this program, Python and the main packages, and the machine.
+
+    On different processors, or with different kernels of linear algebra (`blas`), results are rounded differently.
+    """
     names = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "rerun-sdk")
     return {
         "twin": version("seabed-twin"),
@@ -268,4 +273,6 @@ def environment() -> dict[str, str]:
         "machine": platform.machine(),
         "system": platform.platform(),
         "cpus": str(os.cpu_count()),
+        "processor": llvmlite.binding.get_host_cpu_name(),
+        "blas": " ".join(sorted({str(blas.get("architecture")) for blas in threadpool_info()})),
     } | {name: version(name) for name in names}

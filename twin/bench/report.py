@@ -1,0 +1,145 @@
+"""The benchmark: all rows, their accepted values, and their picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import matplotlib
+import numpy as np
+from pydantic import Field
+
+from twin.bench.measurement import N_ROUNDS, BenchmarkRow, alternate, child_ms, child_peak_mb
+from twin.bench.plain_renderer import PlainRenderer
+from twin.bench.stages import SMALL, stage_rows
+from twin.bench.surveys import surrogate_rows, survey_rows
+from twin.core.timing import Stopwatch
+from twin.report.plotting import log_axis, one_panel
+from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.scenario.file import load_scenario, read_toml, validated
+from twin.scenario.model import Section, Source
+from twin.session.assembly import open_world
+from twin.world.mission import prepare
+
+_SIZES = {f"{w}x{h}": (f"rig.image_width_px={w}", f"rig.image_height_px={h}") for w, h in ((320, 240), (640, 480))}
+_SCENES = "quickstart", "coral_garden", "paper"  #: with `reef`, those whose accuracy is measured
+_LIBRARIES = "import numpy, scipy.sparse, cv2, numba, pydantic"
+_START = {
+    "import": (("-c", "import twin.survey"), ("-c", _LIBRARIES), "import of its libraries"),
+    "twin --help": (("-m", "twin", "--help"), ("-c", "import typer, rich.console"), "import of typer and rich"),
+}
+_PLAIN_PAPER = """
+from twin.bench.report import PlainRenderer, load_scenario, prepare
+mission = prepare(load_scenario("paper"))
+PlainRenderer(mission.terrain, mission.rig).render(mission.start)
+"""
+
+
+class AcceptedValue(Section):
+    """Accepted median of a row: the ratio to its floor, or the value if it has none."""
+
+    value: float = Field(ge=0)
+    """the median"""
+    better: Literal["lower", "higher", "same"] = "lower"
+    """side on which there is no limit"""
+    tolerance: float = Field(gt=0)
+    """largest relative difference from the value"""
+
+    def problem(self, row: BenchmarkRow) -> str:
+        """Returns a line that names the row, its median and the limit if that is exceeded, else ""."""
+        found, low, high = row.spread[0], self.value * (1 - self.tolerance), self.value * (1 + self.tolerance)
+        if (found <= high or self.better == "higher") and (found >= low or self.better == "lower"):
+            return ""
+        return f"{row.name}: {found:.3g}, limit {high if found > high else low:.3g} (accepted: {self.value:g})"
+
+
+class AcceptedValues(Section):
+    rows: dict[str, AcceptedValue]
+    """accepted values by name of the row"""
+
+    def problems(self, rows: Sequence[BenchmarkRow]) -> list[str]:
+        """Returns a line for each measured row that exceeds its limit."""
+        measured = [row for row in rows if row.name in self.rows and len(row.values)]
+        return [problem for row in measured if (problem := self.rows[row.name].problem(row))]
+
+
+def read_accepted(file: Path) -> AcceptedValues:
+    """Returns the accepted values of a TOML file; raises ScenarioError."""
+    tree, lines = read_toml(file)
+    return validated(tree, AcceptedValues, Source(path=file, lines=lines))
+
+
+def measure(full: bool, progress: Callable[[str, float], None]) -> list[BenchmarkRow]:
+    """Returns all rows; without `full`, those that take a few minutes."""
+    parts: dict[str, Callable[[], Sequence[BenchmarkRow]]] = {
+        "stages": lambda: stage_rows(partial(progress, "stages")),
+        "survey": lambda: survey_rows("reef", "reef", SMALL, N_ROUNDS if full else 3),
+        "surrogate": surrogate_rows,
+        "processes": lambda: [*map(_start_row, _START), _opening_row("quickstart")],
+    }
+    if full:
+        parts["large images"] = lambda: survey_rows("reef 640x480", "reef", (*SMALL, *_SIZES["640x480"]), N_ROUNDS)
+        parts |= {scene: partial(survey_rows, scene, scene, SMALL, 1) for scene in _SCENES}
+        parts |= {"opening": lambda: [_opening_row("paper")], "memory": lambda: [*map(_memory_row, _SIZES)]}
+    rows = list[BenchmarkRow]()
+    for k, (name, part) in enumerate(parts.items()):
+        progress(name, k / len(parts))
+        rows += part()
+    return rows
+
+
+def _start_row(name: str) -> BenchmarkRow:
+    *commands, label = _START[name]
+    ours, floor = np.array([[child_ms(*command) for command in commands] for _ in range(N_ROUNDS)]).T
+    return BenchmarkRow(name, "ms", ours, label, floor)
+
+
+def _opening_row(scene: str) -> BenchmarkRow:
+    scenario = load_scenario(scene)
+    mission = prepare(scenario)
+    ours, floor = alternate(
+        lambda: open_world(prepare(scenario), Stopwatch()).close(),
+        lambda: PlainRenderer(mission.terrain, mission.rig).__exit__(),
+    )
+    return BenchmarkRow(f"opening {scene}", "ms", ours, "mujoco.Renderer of its floor", floor)
+
+
+def _memory_row(size: str) -> BenchmarkRow:
+    with TemporaryDirectory(prefix="twin-") as folder:
+        keys = [*SMALL, *_SIZES[size]]
+        ours_mb = child_peak_mb(f"import twin; twin.run('paper', '{folder}/run', {keys})")
+    plain_mb = child_peak_mb(_PLAIN_PAPER)
+    return BenchmarkRow(f"memory of paper {size}", "MB", [ours_mb], "mujoco.Renderer of its floor", [plain_mb])
+
+
+def draw(rows: Sequence[BenchmarkRow], file: Path) -> None:
+    """Writes a picture with a bar for each ratio, and its least and greatest value."""
+    shown = [row for row in rows if len(row.floors)][::-1]
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure, axes = one_panel(1 + 0.25 * len(shown))
+        median, low, high = np.array([row.spread for row in shown]).T
+        labels = [f"{row.name} / {row.floor}" for row in shown]
+        axes.barh(labels, median, 0.6, xerr=[median - low, high - median], color=COLOURS["online"])
+        axes.set_xlabel("ratio to the floor")
+        log_axis(axes.xaxis)
+        figure.savefig(file)
+
+
+def table(rows: Sequence[BenchmarkRow]) -> list[tuple[str, ...]]:
+    """Returns the rows as text, the header first."""
+    text: list[tuple[str, ...]] = [("row", "value", "floor", "ratio", "min to max", "what the floor is")]
+    for row in rows:
+        values = [f"{np.median(part):.4g} {row.unit}" if len(part) else "" for part in (row.values, row.floors)]
+        ratio = [f"{row.spread[0]:.3g}", "{1:.3g} to {2:.3g}".format(*row.spread)] if len(row.floors) else ["", ""]
+        text.append((row.name, *values, *ratio, row.floor))
+    return text
+
+
+def as_json(rows: Sequence[BenchmarkRow], problems: Sequence[str]) -> dict[str, Any]:
+    lists = [{key: np.asarray(value).tolist() for key, value in row._asdict().items()} for row in rows]
+    spreads = [dict(zip(("median", "min", "max"), row.spread, strict=False)) for row in rows]
+    found = [fields | {"spread": spread} for fields, spread in zip(lists, spreads, strict=True)]
+    return {"schema": "twin.bench/1", "rows": found, "problems": list(problems)}
