@@ -89,7 +89,8 @@ def test_inverse_blocks_are_those_of_the_dense_inverse(factored):
 
 def test_samples_of_unit_vectors_are_a_root_of_the_dense_inverse(factored):
     factor, dense = factored
-    root = np.array([factor.sample(unit.reshape(-1, 6)).ravel() for unit in np.eye(len(dense))]).T
+    units = np.eye(len(dense)).reshape(len(dense), -1, 6)
+    root = factor.sample(units).reshape(dense.shape)
     expected = np.linalg.inv(dense)
     np.testing.assert_allclose(root @ root.T, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 

@@ -588,7 +588,6 @@ def bench(
     as_json: Annotated[bool, option("Print only the rows, as JSON.", flag="--json")] = False,
 ) -> None:
     """Measure the cost of each stage as a ratio to that of the best library call or limit, side by side."""
-    _require_rendering()
     from twin.bench import report as benchmark
 
     accepted, file = against and benchmark.read_accepted(against), out and outputs.output_file(out)

@@ -44,7 +44,7 @@ def kernel(function: Any = None, /, **options: Any) -> Any:
     if function is None:
         return lambda decorated: kernel(decorated, **options)
     dispatcher: Any = numba.njit(nogil=True, **options)(function)
-    if _cache_folder(Path(function.__code__.co_filename).resolve(), function.__module__) is not None:
+    if cache_folder(Path(function.__code__.co_filename).resolve(), function.__module__) is not None:
         _enable_caching(dispatcher)
     return dispatcher
 
@@ -57,7 +57,7 @@ class KernelLocator:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelLocator | None:
-        folder = _cache_folder(Path(file).resolve(), function.__module__)
+        folder = cache_folder(Path(file).resolve(), function.__module__)
         return cls(folder, function.__code__.co_firstlineno) if folder is not None else None
 
     def ensure_cache_path(self) -> None:
@@ -90,8 +90,11 @@ def source_hash(file: Path) -> str:
 
 
 @cache
-def _cache_folder(file: Path, name: str) -> Path | None:
-    """Returns the folder of a module's code, whose name may differ between checkouts; None if none can be written."""
+def cache_folder(file: Path, name: str) -> Path | None:
+    """Returns the folder of a module's code, whose name may differ between checkouts; None if none can be written.
+
+    Other results of the module that its sources and their arguments determine may be kept there too.
+    """
     module = cache_root() / name
     folder = module / source_hash(file)
     try:

@@ -35,6 +35,7 @@ _MAX_ROUNDS = 10
 _MAX_ITERATIONS = 100
 _ROUND_ITERATIONS = 10  # iterations per round; the Huber weights converge slowly while the graph has gross outliers
 _DRAWS = 200  # drawn errors of all poses, from which the number of independent errors is estimated to about 15 %
+_DRAWN_AT_ONCE = 20  # of them, to limit memory
 _HUBER = 3.0  # threshold of the Huber loss in standard deviations
 
 
@@ -138,19 +139,20 @@ def _mean_chi2(links: Links, chi2: Array) -> float:
 
 
 def _draw_positions(solution: Solution) -> Array:
-    """Returns errors (`_DRAWS`, n - 1, 3) of the positions of all nodes but the first, the reference [m]."""
+    """Returns errors (n - 1, 3, `_DRAWS`) of the positions of all nodes but the first, the reference [m]."""
     rng = np.random.default_rng(0)
-    return np.array([solution.sample(rng)[1:, 3:] for _ in range(_DRAWS)])
+    parts = [solution.sample(_DRAWN_AT_ONCE, rng)[1:, 3:] for _ in range(_DRAWS // _DRAWN_AT_ONCE)]
+    return np.concatenate(parts, axis=2)
 
 
 def _independent_errors(draws: Array, covs: Array) -> float | None:
     """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes.
 
-    Of 3 k squared normal numbers, the sum divided by k has the variance 6 / k. `draws` (m, n, 3) are errors drawn from
+    Of 3 k squared normal numbers, the sum divided by k has the variance 6 / k. `draws` (n, 3, m) are errors drawn from
     the joint covariance [m], `covs` (n, 3, 3) [m2]; None without a node of known covariance.
     """
     known = np.linalg.eigvalsh(covs)[:, 0] > 0
     if not known.any():
         return None
-    whitened = np.linalg.solve(np.linalg.cholesky(covs[known]), draws[:, known, :, None])[..., 0]
-    return float(6 / np.var(np.sum(whitened**2, axis=(1, 2)) / known.sum()))
+    whitened = np.linalg.solve(np.linalg.cholesky(covs[known]), draws[known])
+    return float(6 / np.var(np.sum(whitened**2, axis=(0, 1)) / known.sum()))

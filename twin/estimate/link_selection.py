@@ -81,19 +81,19 @@ def choose_links(
     others = sorted(rest[len(same) :], key=lambda k: -shares[k])
     oldest = [min(others)] if others else []
     rest = [k for k in others if k not in oldest]
-    chosen = previous + same[-1:] + oldest + _spread(rest, earlier)
+    chosen = previous + same[-1:] + oldest + _spread(rest, earlier, settings.node_stride)
     return [(earlier[k], float(shares[k])) for k in chosen[: settings.max_links]]
 
 
-def _spread(others: list[int], earlier: Sequence[Keyframe]) -> list[int]:
+def _spread(others: list[int], earlier: Sequence[Keyframe], stride: int) -> list[int]:
     """Returns the indices `others` of earlier nodes in their order, but neighbours of nodes before them come last."""
-    numbers = np.array([node.number for node in earlier])
-    stride = np.diff(numbers).min(initial=numbers[-1] + 1) if others else 1
-    chosen: list[int] = []
+    chosen, last, near = list[int](), list[int](), set[int]()
     for k in others:
-        if all(abs(numbers[k] - numbers[c]) > stride for c in chosen):
-            chosen.append(k)
-    return chosen + [k for k in others if k not in chosen]
+        number = earlier[k].number
+        (last if number in near else chosen).append(k)
+        if number not in near:
+            near |= {number - stride, number, number + stride}
+    return chosen + last
 
 
 def to_link(node: Keyframe, other: Keyframe, overlap: float, motion: Motion) -> Link:

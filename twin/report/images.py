@@ -23,6 +23,11 @@ def jpeg_bytes(image: Image, longest_px: int) -> bytes:
     return data.tobytes()
 
 
+def png_bytes(image: Image) -> bytes:
+    _, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    return data.tobytes()
+
+
 def read_rgb(file: Path) -> Image | None:
     """Returns a PNG or JPEG file as RGB; None if it is missing or not such an image."""
     try:

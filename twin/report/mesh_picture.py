@@ -12,14 +12,13 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
-from twin.core import geometry
-from twin.core.records import Array, Image
-from twin.report.images import read_rgb
+if TYPE_CHECKING:  # loading other modules would take most of the time of the program
+    from twin.core.records import Array, Image
 
 #: Time limit of the rendering process; if rendering takes longer, the report has no picture of the surface.
 LIMIT_S = 15.0
@@ -42,6 +41,8 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
         map_from_world: (4, 4) pose of the world in the map, whose axes are east, north and up of the picture; None: the
             identity.
     """
+    from twin.report.images import read_rgb
+
     if not mesh_file.is_file():
         return None
     try:
@@ -78,6 +79,9 @@ def render_mesh(mesh: Any) -> Image:
 
 def in_map_frame(vertices: Array, map_from_world: Array) -> Array:
     """Returns vertices (n, 3) of a mesh in the world in the frame of its map, both in the axes of glTF [m]."""
+    if np.array_equal(map_from_world, np.eye(4)):
+        return vertices
+    from twin.core import geometry
     from twin.exchange.mesh import GLB_FROM_WORLD  # imports trimesh, which only this process needs
 
     return geometry.transform(map_from_world, vertices @ GLB_FROM_WORLD) @ GLB_FROM_WORLD.T

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from twin.core.georeference import Georeference
+from twin.report.images import png_bytes
 from twin.report.style import FIGURE_STYLE
 
 WIDTH_IN = 9.6
+PAD_IN = 0.08  #: white margin around a figure
 
 
 def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> dict[str, str]:
@@ -28,9 +30,15 @@ def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> 
 
 
 def to_data_uri(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.08)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    """Returns a figure without its white margins as PNG data URI; matplotlib's own `tight` would draw it twice."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    inked = (pixels != 255).any(axis=2)
+    rows, cols = (np.flatnonzero(inked.any(axis=axis)) for axis in (1, 0))
+    pad = round(PAD_IN * figure.dpi)
+    kept = tuple(slice(max(0, at[0] - pad), at[-1] + pad + 1) for at in (rows, cols)) if len(rows) else ()
+    return "data:image/png;base64," + base64.b64encode(png_bytes(pixels[kept])).decode()
 
 
 def one_panel(height_in: float) -> tuple[Figure, Axes]:

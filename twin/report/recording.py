@@ -43,7 +43,10 @@ class FrameTimes(NamedTuple):
 
 def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
     """Writes run.rrd into a run folder and returns its path; arguments and errors are those of `load_run`."""
-    run = load_run(folder, metrics)
+    return record_run(load_run(folder, metrics))
+
+
+def record_run(run: Run) -> Path:
     file = run.folder / "run.rrd"
     rig = replayed_rig(run.scenario)
     if rig is None:  # no plug-in is loaded for it

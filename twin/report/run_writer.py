@@ -34,6 +34,7 @@ from twin.scenario.model import Scenario
 if TYPE_CHECKING:
     from twin.exchange.geotiff import OrthomosaicFile
     from twin.exchange.tiled_map import TiledMapFolder
+    from twin.report.run_folder import Run
 
 #: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
 OPTIONAL_OUTPUTS = ("report", "recording")
@@ -87,12 +88,13 @@ class RunFolder:
     def __init__(
         self, folder: Path, scenario: Scenario | RunDescription, outputs: Collection[str] | None = OPTIONAL_OUTPUTS
     ):
-        text = scenario.text if isinstance(scenario, RunDescription) else scenario_file.dump_toml(scenario)
         self.path, self._reserve, self._outputs = folder, folder / ".reserve", outputs
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._log = (folder / _LOG).open("w", encoding="utf-8")
-            self._write("scenario.resolved.toml", text)
+            if outputs is not None:
+                text = scenario.text if isinstance(scenario, RunDescription) else scenario_file.dump_toml(scenario)
+                self._write("scenario.resolved.toml", text)
             self._write("env.json", json.dumps(environment(), indent=1))
             self._reserve.write_bytes(bytes(_RESERVE_BYTES))
         except OSError as error:
@@ -147,9 +149,10 @@ class RunFolder:
                 self._write_trajectories(record)
                 kept = ("mosaic.tif",) if record.has_orthomosaic else ()
                 self._attempt(guard, "maps", lambda: self._write_maps(record), kept)
+                written = cache(lambda: _written_run(self.path, metrics))  # read once for both outputs
                 for name in OPTIONAL_OUTPUTS:
                     if name in self._outputs:
-                        self._attempt(guard, name, lambda name=name: self._write_optional_output(name, metrics))
+                        self._attempt(guard, name, lambda name=name: _write_optional_output(name, written()))
         except OSError as error:
             guard.cause = guard.cause or str(error)
         if guard.reason:
@@ -245,15 +248,22 @@ class RunFolder:
             geotiff.write_map(self.path, elevation, origin, mosaic=not record.has_orthomosaic)
             mesh.write_glb(self.path / "mesh.glb", elevation)
 
-    def _write_optional_output(self, name: str, metrics: dict[str, Any]) -> None:
-        if name == "report":
-            from twin.report import survey_page
 
-            survey_page.write_report(self.path, metrics)
-        else:
-            from twin.report import recording
+def _written_run(folder: Path, metrics: dict[str, Any]) -> Run:
+    from twin.report.run_folder import load_run
 
-            recording.write_recording(self.path, metrics)
+    return load_run(folder, metrics)
+
+
+def _write_optional_output(name: str, run: Run) -> None:
+    if name == "report":
+        from twin.report import survey_page
+
+        survey_page.write_page(run)
+    else:
+        from twin.report import recording
+
+        recording.record_run(run)
 
 
 def _error_m(elevation: ElevationMap, truth: Truth) -> NDArray[np.float32]:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
@@ -255,8 +254,8 @@ def network_plot(run: Run) -> Figure | None:
     figure, axes = one_panel(4.4)
     _map_axes(axes, run)
     axes.set_adjustable("datalim")  # a network along a line fills the figure too
-    links = list(positions[edges][:, :, :2])
-    axes.add_collection(LineCollection(links, colors=COLOURS["link"], linewidths=0.5, alpha=0.6))
+    ends = np.pad(positions[edges][:, :, :2], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)  # a gap after each link
+    axes.plot(*ends.reshape(-1, 2).T, color=COLOURS["link"], linewidth=0.5, alpha=0.6)
     axes.plot(positions[:, 0], positions[:, 1], ".", markersize=3, color=COLOURS["final"])
     axes.set_title(f"{len(positions)} keyframes, {len(edges)} links")
     return figure

@@ -30,8 +30,12 @@ N_SAMPLES = 4
 
 def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
     """Writes report.html into a run folder and returns its path; arguments and errors are those of `load_run`."""
-    file = Path(folder) / "report.html"
-    file.write_text(render(load_run(folder, metrics)), encoding="utf-8")
+    return write_page(load_run(folder, metrics))
+
+
+def write_page(run: Run) -> Path:
+    file = run.folder / "report.html"
+    file.write_text(render(run), encoding="utf-8")
     return file
 
 

@@ -12,21 +12,30 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates, maximum_filter, uniform_filter
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.height_field import HeightField, cast_pixels
+from twin.core.height_field import HeightField
 from twin.core.quality import CalibrationEstimate
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
+from twin.surrogate.cell_view import (
+    Cameras,
+    FloorCells,
+    extend_runs,
+    mapped_heights,
+    mark_visible,
+    pose_variances,
+    visible_cells,
+    window_in_reach,
+)
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_relief import Map, floor_relief
 from twin.surrogate.height_errors import CellConditions, HeightSigmas, KeyframeRuns, cell_conditions, height_sigmas
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
-from twin.world.observed_cells import DEPTH_TOLERANCE
 
 Index = NDArray[np.int64]
 #: Side of the square over which errors are correlated, in matching windows: dense matching is regularised, and the
@@ -35,6 +44,8 @@ _CORRELATED_WINDOWS = 1.5
 #: Rise over run of a line from a cell; floor below this line is taken not to hide the cell. This is exact for rays that
 #: are at most 45 deg from the vertical.
 _HIDING_SLOPE = 1.0
+
+_NO_CELLS: Index = np.zeros(0, np.int64)
 
 
 class ObservedCells(NamedTuple):
@@ -78,16 +89,24 @@ class MapModel:
         view: MeasuredView = IDEAL_VIEW,
     ):  # fmt: skip
         self.grid, self.height_m, self.seen = grid, height_m, np.zeros(height_m.shape, np.bool_)
-        self._rig, self._floor, self._matchability, self._view = rig, floor, matchability, view
+        self._rig, self._matchability = rig, matchability
         self.relief = floor_relief(height_m, grid.cell_m, rig, matchability.medium_depth_m)
-        self._may_be_hidden = _may_be_hidden(height_m, grid.cell_m).ravel()
-        self._information = 1 / np.square(matchability.dependence.bounds)
-        self._baseline_m = rig.baseline_m  # that of self-calibration
+        self._cells = FloorCells(
+            grid.west_m, grid.north_m, grid.cell_m, grid.rows, grid.cols, np.ascontiguousarray(height_m.ravel()),
+            self.relief.slope.reshape(-1, 2), _may_be_hidden(height_m, grid.cell_m).ravel(), floor,
+        )  # fmt: skip
+        self._cameras = Cameras(
+            rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), rig.baseline_m, view.table,
+            rig.baseline_m, 1 / np.square(matchability.dependence.bounds),
+        )  # fmt: skip
         self._lowest_m = float(np.nanmin(height_m))
-        self.conditions = CellConditions(*np.zeros((len(CellConditions._fields), height_m.size)))
+        self._conditions = np.zeros((len(CellConditions._fields), height_m.size))
         self.n_heights = np.zeros(height_m.size, np.int64)
-        # of the consecutive keyframes up to the current one
-        self._views, self._squared_steps, self._border_px, self._sum = np.zeros((4, height_m.size))
+        self._runs = np.zeros((4, height_m.size))  # see `extend_runs`
+
+    @property
+    def conditions(self) -> CellConditions:
+        return CellConditions(*self._conditions)
 
     @property
     def correlated_cells(self) -> int:
@@ -95,8 +114,7 @@ class MapModel:
 
     def new_noise(self, model: ErrorModel, rng: np.random.Generator) -> MapNoise:
         """Returns random numbers of the errors of a map, and forgets the keyframes of earlier maps."""
-        for values in (self._views, self._squared_steps, self._border_px, self._sum, self.n_heights):
-            values[:] = 0
+        self._runs[:], self.n_heights[:] = 0, 0
         shape, cells = self.height_m.shape, self.correlated_cells
         lateral, dropout = rng.standard_normal(shape, np.float32), rng.random(shape, np.float32)
         relief, scatter, edge = (window_noise(shape, cells, rng) for _ in range(3))
@@ -105,30 +123,23 @@ class MapModel:
 
     def calibrate(self, found: CalibrationEstimate) -> None:
         """Corrects the heights of the next map for errors of the calibration that were found."""
-        self._view = self._view.without_yaw(found.yaw_rad)
-        self._baseline_m = self._rig.baseline_m * (1 + found.baseline_error)
+        table = self._cameras.table._replace(yaw_rad=found.yaw_rad)
+        baseline_m = self._rig.baseline_m * (1 + found.baseline_error)
+        self._cameras = self._cameras._replace(table=table, estimated_baseline_m=baseline_m)
 
     def mark_seen(self, world_from_camera: Array) -> None:
         """Marks the cells that both cameras see from the true pose (4, 4) of a keyframe."""
-        index = self._in_reach(world_from_camera)
-        index = index[~self.seen.ravel()[index]]
-        visible, _ = self._seen_from(world_from_camera, index, self._centres(index))
-        self.seen.ravel()[visible] = True
+        window = window_in_reach(self._cells, self._cameras, self._lowest_m, world_from_camera)
+        mark_visible(self._cells, self._cameras, window, world_from_camera, self.seen.reshape(-1))
 
     def observe(self, true: Array, estimated: Array) -> ObservedCells:
         """Returns the cells that a keyframe with a true and an estimated pose (4, 4) observes.
 
         With calibration errors or an approximated port, the estimated pose determines which point is mapped to a cell.
         """
-        index = self._in_reach(true)
-        visible, points = self._seen_from(true, index, self._sources(true, estimated, index))
-        measured = self._view.measure(points)
-        rig, table = self._rig, self._information
-        pixels = measured[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]
-        blocks = (pixels + 0.5) / [rig.width_px, rig.height_px] * table.shape[::-1] - 0.5
-        information = map_coordinates(table, blocks.T[::-1], order=1, mode="nearest")
-        depth_m, border_px = rig.baseline_m / points[:, 2], _border_px(measured, rig)
-        return ObservedCells(visible, depth_m, border_px, information, true, estimated)
+        window = window_in_reach(self._cells, self._cameras, self._lowest_m, true)
+        found = visible_cells(self._cells, self._cameras, window, true, estimated)
+        return ObservedCells(*found, true, estimated)
 
     def sample_patch(
         self,
@@ -167,7 +178,8 @@ class MapModel:
         ):  # fmt: skip
             error += sigma_m * normal.ravel()[index]
         height, variance, systematic = np.full((3, *shape), np.nan, np.float32)
-        height[i, k] = self._heights(observed, index) + error
+        mapped_m = mapped_heights(self._cells, self._cameras, index, observed.true, observed.estimated)
+        height[i, k] = mapped_m + error
         variance[i, k] = typical_m**2
         systematic[i, k] = self._pose_variances(observed.estimated, cov, index) + lateral_m**2
         if not np.isfinite(np.stack([values[i, k] for values in (height, variance, systematic)])).all():
@@ -178,107 +190,28 @@ class MapModel:
 
     def _end_runs(self, observed: ObservedCells, following: ObservedCells | None) -> tuple[Index, CellConditions]:
         """Adds a keyframe to the runs of its cells; returns those that the next one does not see, with conditions."""
-        index = observed.cells
-        self._views[index] += 1
-        self._border_px[index] = np.maximum(self._border_px[index], observed.border_px)
-        self._sum[index] += observed.information
-        ended = np.ones(len(index), np.bool_)
+        index, following_index, squared_step = observed.cells, _NO_CELLS, 0.0
         if following is not None:
-            ended = ~np.isin(index, following.cells, assume_unique=True)
             step_m = float(np.linalg.norm(following.true[:3, 3] - observed.true[:3, 3]))
-            self._squared_steps[index[~ended]] += (step_m / self._rig.baseline_m) ** 2
-        last = index[ended]
-        number = self._views[last]
-        step = np.sqrt(self._squared_steps[last] / np.maximum(number - 1, 1))
-        bound_ratio = np.sqrt(number / self._sum[last])
-        views = KeyframeRuns(observed.depth_m[ended], number, step, self._border_px[last], bound_ratio)
+            following_index, squared_step = following.cells, (step_m / self._rig.baseline_m) ** 2
+        ended, (number, squared_steps, border_px, information) = extend_runs(
+            self._runs, index, observed.border_px, observed.information, following_index, squared_step
+        )
+        last, step = index[ended], np.sqrt(squared_steps / np.maximum(number - 1, 1))
+        views = KeyframeRuns(observed.depth_m[ended], number, step, border_px, np.sqrt(number / information))
         cells = cell_conditions(self._matchability, self._rig, self.relief, last, views)
-        for kept, new in zip(self.conditions, cells, strict=True):
-            kept[last] = new
+        self._conditions[:, last] = cells
         self.n_heights[last] += 1
-        for values in (self._views, self._squared_steps, self._border_px, self._sum):
-            values[last] = 0
         return last, cells
 
-    def _heights(self, observed: ObservedCells, index: Index) -> Array:
-        """Returns the heights (n,) of the cells without errors of measurement, mapped from the estimated pose."""
-        slope, centres = self.relief.slope.reshape(-1, 2)[index], self._centres(index)
-        sources = self._sources(observed.true, observed.estimated, index)
-        mapped = self._mapped(observed.true, observed.estimated, sources)
-        return mapped[:, 2] - np.einsum("nk,nk->n", slope, mapped[:, :2] - centres[:, :2])
-
     def _pose_variances(self, estimated: Array, cov: Array, index: Index) -> Array:
-        """Returns the variances (n,) of the heights due to the error of a pose; see `surface.pose_variance`."""
+        """Returns the variances (n,) of the heights due to the error of a pose, with `cov` (6, 6) in its axes."""
         rotation = geometry.adjoint(geometry.pose(estimated[:3, :3], np.zeros(3)))
-        slope, points = self.relief.slope.reshape(-1, 2)[index], self._centres(index) - estimated[:3, 3]
-        normal = np.column_stack([-slope, np.ones(len(index))])
-        jacobian = np.hstack([np.cross(points, normal), normal]) @ rotation
-        return np.einsum("ni,ij,nj->n", jacobian, cov, jacobian)
+        return pose_variances(self._cells, index, estimated[:3, 3], rotation @ cov @ rotation.T)
 
     def _window(self, index: Index) -> tuple[int, int, tuple[int, int]]:
         rows, cols = index // self.grid.cols, index % self.grid.cols
         return int(rows[0]), int(cols.min()), (int(rows[-1] - rows[0]) + 1, int(np.ptp(cols)) + 1)
-
-    def _centres(self, index: Index) -> Array:
-        """Returns the true floor points (n, 3) at the centres of cells."""
-        x, y = self.grid.centres()
-        heights = self.height_m.ravel()[index].astype(np.float64)
-        return np.column_stack([x[index % self.grid.cols], y[index // self.grid.cols], heights])
-
-    def _sources(self, true: Array, estimated: Array, index: Index) -> Array:
-        """Returns the true floor points (n, 3) that are mapped to cells: their centres minus the mapping errors."""
-        centres = self._centres(index)
-        if self._view.is_ideal:
-            return centres
-        shift = self._mapped(true, estimated, centres)[:, :2] - centres[:, :2]
-        slope = self.relief.slope.reshape(-1, 2)[index]
-        return centres - np.column_stack([shift, np.einsum("nk,nk->n", slope, shift)])
-
-    def _mapped(self, true: Array, estimated: Array, points: Array) -> Array:
-        """Returns the estimated positions (n, 3) of world points (n, 3) seen from a true pose."""
-        measured = self._view.measure(self._normalised(true, points))
-        depth_m = self._baseline_m / measured[:, 2:]
-        return geometry.transform(estimated, np.column_stack([measured[:, :2], np.ones(len(points))]) * depth_m)
-
-    def _normalised(self, true: Array, points: Array) -> Array:
-        """Returns the normalised (x, y, disparity) (n, 3) of world points (n, 3) in front of the left camera."""
-        seen = geometry.transform(geometry.inverse(true), points)
-        return np.column_stack([seen[:, :2], np.full(len(seen), self._rig.baseline_m)]) / seen[:, 2:]
-
-    def _seen_from(self, true: Array, index: Index, points: Array) -> tuple[Index, Array]:
-        """Returns the cells whose floor points (n, 3) both cameras see, and the points as normalised (m, 3)."""
-        front = geometry.transform(geometry.inverse(true), points)[:, 2] > 0
-        index, normalised = index[front], self._normalised(true, points[front])
-        inside = _border_px(self._view.measure(normalised), self._rig) >= 0
-        index, normalised = index[inside], normalised[inside]
-        visible, doubtful = np.ones(len(index), np.bool_), np.flatnonzero(self._may_be_hidden[index])
-        visible[doubtful] = ~self._are_hidden(true, normalised[doubtful])
-        return index[visible], normalised[visible]
-
-    def _are_hidden(self, true: Array, normalised: Array) -> NDArray[np.bool_]:
-        """Returns whether relief hides floor points, normalised (n, 3), from either camera."""
-        rig, hidden = self._rig, np.zeros(len(normalised), np.bool_)
-        for to_camera_m, shift in ((0.0, 0.0), (rig.baseline_m, normalised[:, 2])):
-            camera = geometry.compose(true, geometry.pose(np.eye(3), np.array([to_camera_m, 0.0, 0.0])))
-            directions = np.column_stack([normalised[:, 0] - shift, normalised[:, 1]])
-            pixels = directions * rig.focal_px + [rig.cx_px, rig.cy_px]
-            met_m = cast_pixels(self._floor, camera[None], rig, pixels)[0]
-            hidden |= met_m < (1 - DEPTH_TOLERANCE) * rig.baseline_m / normalised[:, 2]
-        return hidden
-
-    def _in_reach(self, world_from_camera: Array) -> Index:
-        """Returns the cells in the bounding box of the lowest floor in the left image; all if it shows the horizon."""
-        rig, grid = self._rig, self.grid
-        corners = np.array([[u, v] for u in (-0.5, rig.width_px - 0.5) for v in (-0.5, rig.height_px - 0.5)])
-        rays = np.column_stack([rig.normalised(corners), np.ones(4)]) @ world_from_camera[:3, :3].T
-        if rays[:, 2].max() >= -0.1:
-            return np.arange(self.height_m.size)
-        position = world_from_camera[:3, 3]
-        far = position[:2] + rays[:, :2] * ((self._lowest_m - position[2]) / rays[:, 2:])
-        (west, south), (east, north) = (f(np.vstack([far, position[None, :2]]), axis=0) for f in (np.min, np.max))
-        rows = np.clip(((grid.north_m - np.array([north, south])) / grid.cell_m).astype(int) + [-1, 2], 0, grid.rows)
-        cols = np.clip(((np.array([west, east]) - grid.west_m) / grid.cell_m).astype(int) + [-1, 2], 0, grid.cols)
-        return (np.arange(*rows)[:, None] * grid.cols + np.arange(*cols)).ravel()
 
 
 def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
@@ -293,13 +226,6 @@ def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Gener
 def heavy_tailed(noise: Map) -> Map:
     """Returns n |n| / sqrt(3), of unit variance: heavy tails, because cells near a wall may match the wrong surface."""
     return np.asarray(noise * np.abs(noise) / np.float32(np.sqrt(3)), np.float32)
-
-
-def _border_px(points: Array, rig: StereoRig) -> Array:
-    """Returns the distances (n,) of normalised (x, y, disparity) (n, 3) from the border of the two images [px]."""
-    u, v = (points[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]).T
-    u_right = u - rig.focal_px * points[:, 2]
-    return np.min([v, rig.height_px - 1 - v, rig.width_px - 1 - u, u_right], axis=0)
 
 
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -215,9 +215,13 @@ class Matchability:
 
     def bound_at(self, depth_m: Array | float) -> Array:
         """Returns the bound [px of the binned images] at depths [m]: a parabola in logarithms, constant outside."""
-        depth_m, bounds_px = np.clip(depth_m, *self.depths_m[[0, -1]]), np.clip(self.bounds_px, *_BOUND_LIMITS_PX)
-        parabola = np.polyfit(np.log(self.depths_m / self.medium_depth_m), np.log(bounds_px), 2)
-        return np.exp(np.polyval(parabola, np.log(depth_m / self.medium_depth_m)))
+        depth_m = np.clip(depth_m, *self.depths_m[[0, -1]])
+        return np.exp(np.polyval(self._parabola, np.log(depth_m / self.medium_depth_m)))
+
+    @cached_property
+    def _parabola(self) -> Array:
+        bounds_px = np.clip(self.bounds_px, *_BOUND_LIMITS_PX)
+        return np.polyfit(np.log(self.depths_m / self.medium_depth_m), np.log(bounds_px), 2)
 
     def clear_share_at(self, depth_m: float) -> float:
         """Returns the fraction of the matches that remain in marine snow at a depth."""

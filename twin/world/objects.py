@@ -11,10 +11,11 @@ import numpy as np
 from twin import terrains
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario
+from twin.terrains.objects.built_models import built_model
 from twin.terrains.objects.mesh_file import read_mesh
 from twin.terrains.objects.placed_object import ObjectModel, PlacedObject, model_of
 from twin.terrains.objects.scattering import place
-from twin.terrains.objects.shapes import SHAPES, build_shape
+from twin.terrains.objects.shapes import SHAPES
 from twin.world.scenario_checks import keys_without_effect
 
 GREY = (0.4, 0.4, 0.4)  #: albedo of a mesh without colours
@@ -74,8 +75,7 @@ def _models(number: int, config: ObjectConfig, seed: int, variant: int | None) -
     seeds = np.random.SeedSequence([seed, name]).spawn(shape.variants)
     if variant is not None:
         seeds = [seeds[variant]]
-    meshes = [build_shape(config.shape, config.colour, np.random.default_rng(s), **form) for s in seeds]
-    return tuple(model_of(mesh, shape.sways) for mesh in meshes)
+    return tuple(built_model(config.shape, config.colour, each, **form) for each in seeds)
 
 
 def _pipe_width(config: ObjectConfig) -> float:

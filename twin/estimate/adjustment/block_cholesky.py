@@ -37,11 +37,11 @@ class CholeskyFactor(NamedTuple):
         return x[s.permutation]
 
     def sample(self, normals: Array) -> Array:
-        """Returns vectors L^-T z (n, 6), whose covariance is the inverse matrix, from normal numbers z (n, 6)."""
+        """Returns m vectors L^-T z (n, 6, m), of covariance the inverse matrix, from normal numbers z (m, n, 6)."""
         s = self.symbolic
-        x = normals.reshape(-1).copy()
+        x = np.ascontiguousarray(normals.reshape(len(normals), -1).T)
         _solve_transposed_in_place(s, self.panels, x)
-        return x.reshape(normals.shape)[s.permutation]
+        return x.reshape(-1, _D, len(normals))[s.permutation]
 
     def inverse_block(self, node: int) -> Array:
         """Returns the diagonal block (6, 6) of the inverse matrix that belongs to a node.
@@ -251,14 +251,17 @@ def _solve_in_place(s, panels, x):
 
 @kernel
 def _solve_transposed_in_place(s, panels, x):
-    """Solves the linear system of the transposed factor, L' y = x; x (6 n,), in elimination order, becomes y."""
+    """Solves the linear system of the transposed factor, L' y = x; x, (6 n,) or (6 n, m), becomes y.
+
+    x is in elimination order.
+    """
     for p in range(len(s.panel_start) - 2, -1, -1):
         own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
         panel = _panel_matrix(s, panels, p)
         if len(panel) > len(own):
-            below = np.empty(len(panel) - len(own))
+            below = np.empty((len(panel) - len(own), *x.shape[1:]))
             for k in range(s.row_start[p], s.row_start[p + 1]):
-                for i in range(_D):
-                    below[_D * (k - s.row_start[p]) + i] = x[_D * s.rows[k] + i]
+                part, row = below[_D * (k - s.row_start[p]) :], _D * s.rows[k]
+                geometry.copy_into(part[:_D], x[row : row + _D])
             own -= np.dot(panel[len(own) :].T, below)
         geometry.copy_into(own, np.dot(panel[: len(own)].T, own))

@@ -128,11 +128,13 @@ class Solution(NamedTuple):
     def marginal(self, k: int) -> Array:
         return self._add_shared(self.cholesky.inverse_block(k)[None], slice(k, k + 1))[0]
 
-    def sample(self, rng: np.random.Generator) -> Array:
-        """Returns errors (n, 6) of all poses, drawn from their joint covariance; units and axes as of the marginals."""
-        errors = self.cholesky.sample(rng.standard_normal((len(self.state.poses), 6)))
-        root = np.linalg.cholesky(self.shared_cov)
-        return errors + self.by_shared @ (root @ rng.standard_normal(len(root)))
+    def sample(self, n_draws: int, rng: np.random.Generator) -> Array:
+        """Returns errors (n, 6, n_draws) of all poses, drawn from their joint covariance; units as of the marginals."""
+        n, root = len(self.state.poses), np.linalg.cholesky(self.shared_cov)
+        normals = rng.standard_normal((n_draws, 6 * n + len(root)))
+        return self.cholesky.sample(normals[:, : 6 * n].reshape(n_draws, n, 6)) + self.by_shared @ (
+            root @ normals[:, 6 * n :].T
+        )
 
     def _add_shared(self, covs: Array, rows: slice) -> Array:
         """Returns the covariances of the poses `rows`, plus the part due to the shared parameters."""

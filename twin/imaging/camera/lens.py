@@ -80,7 +80,8 @@ def newton(
         if np.nanmax(np.abs(residual), initial=0.0) < tolerance:
             break
         at = at - _solved(jacobian_at(at, residual), residual)
-    converged = np.abs(residual_at(at)).max(axis=-1) < factor * tolerance
+    x, y = np.moveaxis(np.abs(residual_at(at)), -1, 0)
+    converged = np.maximum(x, y) < factor * tolerance
     return np.where(converged[..., None], at, np.nan)
 
 

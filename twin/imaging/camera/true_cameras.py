@@ -8,6 +8,7 @@ If both true cameras equal the believed ones, the rendered image is used unchang
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,12 +35,12 @@ class CameraModel(NamedTuple):
     """Model of one camera, true or believed, in the axes of the believed camera."""
 
     focal_px: float  # focal length of the lens: that of the equivalent pinhole camera divided by `pinhole.focal_ratio`
-    principal_px: Array  # (2,) column and row of the principal point
+    principal_px: tuple[float, float]  # column and row of the principal point
     lens: Distortion  # distortion coefficients
     port: PortConfig  # geometry and refractive indices of the port
     pinhole: Pinhole  # pinhole camera in water that is equivalent to lens and port near the optical axis
-    # (3, 3) rotation from this camera to the believed camera, about the centre of `pinhole`
-    believed_from_camera: Array
+    # (3, 3) rotation from this camera to the believed camera, about the centre of `pinhole`; None: they are parallel
+    believed_from_camera: Array | None = None
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
         """Returns origins [m] and directions (..., 3) in water, in believed axes, of pixels (..., 2); NaN if none."""
@@ -48,11 +49,16 @@ class CameraModel(NamedTuple):
             air = air / self.pinhole.focal_ratio
         origin, direction = ports.water_rays(self.port, air)
         origin = origin - [0.0, 0.0, self.pinhole.centre_m]
-        return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
+        return self.in_believed_axes(origin), self.in_believed_axes(direction)
+
+    def in_believed_axes(self, vectors: Array) -> Array:
+        return vectors if self.believed_from_camera is None else vectors @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
         """Returns the pixels (..., 2) of points (..., 3) [m] in front of the believed camera; NaN if there is none."""
-        points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
+        if self.believed_from_camera is not None:
+            points_m = points_m @ self.believed_from_camera
+        points_m = points_m + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_coordinates(self.port, points_m)
         if self.port.kind == "none":
             air = air * self.pinhole.focal_ratio
@@ -130,11 +136,11 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     rectification = None
     border = np.zeros(2, np.int64)
     if calibrated or any(believed.lens):
-        rectification = _rectification(believed, believed_rig, depth_m)
+        rectification = _rectification(believed, _size_px(believed_rig), believed_rig.focal_px, depth_m)
         border = _missing_px(rectification, believed_rig)
         rectification = rectification + border
-    pixels = _grid(believed_rig, border)
-    rays = [_rendered_rays(model, pixels, believed_rig) for model in models]
+    columns, rows = border.tolist()
+    rays = [_rendered_rays(model, (columns, rows), believed_rig) for model in models]
     margin = _margin(rays, believed_rig)
     raw_rig = replace(_enlarged(true_rig, border), focal_px=models[0].focal_px)
     left, right = (
@@ -148,18 +154,18 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
 
 def _models(scenario: Scenario) -> tuple[tuple[CameraModel, CameraModel], CameraModel]:
     calibration, port, rig = scenario.true_calibration_error(), scenario.port, scenario.believed_rig()
-    pinhole, principal_px = ports.pinhole(port), np.array([rig.cx_px, rig.cy_px])
+    pinhole, (x_px, y_px) = ports.pinhole(port), (rig.cx_px, rig.cy_px)
     focal_px, lens = rig.focal_px / pinhole.focal_ratio, lenses.true_lens(scenario.lens)
 
-    def true_model(error_px: tuple[float, float], rotation: Array) -> CameraModel:
-        focal = focal_px * (1 + calibration.focal_error)
-        return CameraModel(focal, principal_px + error_px, lens, port, pinhole, rotation)
+    def true_model(error_px: tuple[float, float], rotation: Array | None = None) -> CameraModel:
+        focal, principal_px = focal_px * (1 + calibration.focal_error), (x_px + error_px[0], y_px + error_px[1])
+        return CameraModel(focal, principal_px, lens, port, pinhole, rotation)
 
-    left = true_model(calibration.left_principal_point_error_px, np.eye(3))
+    left = true_model(calibration.left_principal_point_error_px)
     right = true_model(calibration.right_principal_point_error_px, right_rotation(calibration))
     known = (port, pinhole) if port.calibrated_at_m else (PortConfig(), Pinhole(0.0, pinhole.focal_ratio))
     believed_lens = lenses.believed_lens(scenario.lens, calibration)
-    return (left, right), CameraModel(focal_px, principal_px, believed_lens, *known, np.eye(3))
+    return (left, right), CameraModel(focal_px, (x_px, y_px), believed_lens, *known)
 
 
 def right_rotation(calibration: CalibrationErrorConfig) -> Array:
@@ -174,9 +180,10 @@ def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
     return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 
 
-def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
+@lru_cache(maxsize=1)  # the surveys of a study mostly differ in other keys
+def _rectification(believed: CameraModel, size_px: tuple[int, int], focal_px: float, depth_m: float) -> Array:
     """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], as the image of points at `depth_m`."""
-    normalised = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
+    normalised = (_grid(size_px) - believed.principal_px) / focal_px
     points_m = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1) * depth_m
     positions = believed.pixels(points_m)
     if not np.isnan(positions).any():
@@ -186,12 +193,20 @@ def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Arr
     raise TwinError("lens.k1", "the believed lens folds the image back within the frame", "less distortion")
 
 
-def _rendered_rays(camera: CameraModel, pixels: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin."""
+@lru_cache(maxsize=1)  # as of `_rectification`; both cameras mostly have the same lens and port
+def _sensor_rays(camera: CameraModel, size_px: tuple[int, int], border: tuple[int, int]) -> tuple[Array, Array]:
+    """Returns the `rays` of all raw pixels; raises TwinError where the lens folds the image back onto itself."""
+    pixels = _grid(size_px, border)
     distorted = (pixels - camera.principal_px) / camera.focal_px
     if np.isnan(lenses.undistort(distorted, camera.lens)).any():
         raise TwinError("lens.k1", "the lens folds the image back within the sensor", "less distortion")
-    origin, direction = camera.rays(pixels)
+    return camera.rays(pixels)
+
+
+def _rendered_rays(camera: CameraModel, border: tuple[int, int], rig: StereoRig) -> tuple[Array, Array]:
+    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin."""
+    in_own_axes = _sensor_rays(camera._replace(believed_from_camera=None), _size_px(rig), border)
+    origin, direction = (camera.in_believed_axes(vectors) for vectors in in_own_axes)
     if not (direction[..., 2] > 1 / 20).all():
         raise TwinError("port.kind", "no rays reach the image border through the port", "a smaller field of view")
     slope = direction[..., :2] / direction[..., 2:]
@@ -207,10 +222,13 @@ def _or_none(parallax: Array) -> Positions | None:
     return parallax.astype(np.float32) if np.abs(parallax).max() > 1e-9 else None
 
 
-def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
+def _size_px(rig: StereoRig) -> tuple[int, int]:
+    return rig.width_px, rig.height_px
+
+
+def _grid(size_px: tuple[int, int], border: tuple[int, int] = (0, 0)) -> Array:
     """Returns column and row (h, w, 2) of all pixels of an image and its border, from its top left pixel."""
-    columns = np.arange(-border[0], rig.width_px + border[0])
-    rows = np.arange(-border[1], rig.height_px + border[1])
+    columns, rows = (np.arange(-more, n + more) for n, more in zip(size_px, border, strict=True))
     return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
 
 
