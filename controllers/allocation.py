@@ -1,7 +1,5 @@
 """Thrust allocation: converts a wrench on the body to thruster commands."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

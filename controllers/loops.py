@@ -6,8 +6,6 @@ is known, so drift does not accumulate from loop to loop. The bow always points 
 first loop (east if the heading is 0).
 """
 
-from __future__ import annotations
-
 import math
 
 from twin.controllers.segments import Circle, circle, max_circle_speed_mps

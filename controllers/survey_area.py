@@ -4,8 +4,6 @@ Plans are made in the axes of the legs: u along the legs and v to the left of th
 area's extent. `SurveyArea` converts between (u, v) and the scene coordinates (x, y).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Requirements of a survey, and the plan that meets them: the path of every track and the spacing, for any pattern."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple

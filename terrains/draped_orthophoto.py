@@ -1,7 +1,5 @@
 """Texture from an orthophoto: a GeoTIFF with its own coordinate reference system (CRS), resolution and extent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

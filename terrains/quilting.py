@@ -5,8 +5,6 @@ of the photo where it agrees well with the previous blocks in the overlap, and i
 difference through the overlap (Efros & Freeman 2001, Image quilting for texture synthesis and transfer, sec. 2).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Seafloor textures: generated from materials such as sand, rock and coral, or made from a photo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

@@ -7,8 +7,6 @@ to 1 at 65 deg. With the unit normal n, it is divided between them in proportion
 2007, GPU Gems 3, sec. 1.5).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter

@@ -3,8 +3,6 @@
 `python -m twin.app.doctor` renders a test image, in a process of its own, which a faulty graphics driver can crash.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import shutil

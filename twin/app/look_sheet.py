@@ -1,7 +1,5 @@
 """Contact sheet of `twin look`: stereo pair and light components of the left image, with units and value ranges."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

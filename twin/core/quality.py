@@ -1,7 +1,5 @@
 """Records on the quality of a survey: consistency of the estimates, findings, and durations of actions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Recorded readings of navigation sensors (pressure, attitude, DVL, IMU): their checks, and the vertical by an IMU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

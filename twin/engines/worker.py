@@ -4,8 +4,6 @@ A survey renders with OpenGL and runs compiled code, which can crash its process
 Each task therefore runs in a worker process that can be killed and replaced.
 """
 
-from __future__ import annotations
-
 import math
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Verdict on the metrics of a survey: requirements of its scenario, and warnings of values that are out of bounds."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Drawing of a survey plan: the path over the sea floor, and the overlap of the images."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Drawing of a vehicle's limits: speed by thrust, power by speed, and the current that it holds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,12 +1,10 @@
 """Recorded frames of a run: images written during the flight, with times, sensor readings and true poses."""
 
-from __future__ import annotations
-
 import csv
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import cv2
 import numpy as np
@@ -59,7 +57,7 @@ class FrameRecorder:
             for side in ("left", "right"):
                 (self._folder / side).mkdir(exist_ok=True)
 
-    def __enter__(self) -> FrameRecorder:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

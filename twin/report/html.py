@@ -1,7 +1,5 @@
 """Renders pages and texts from Jinja templates; all pages share a style sheet, number formats and a list of terms."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from importlib.resources import files

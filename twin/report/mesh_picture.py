@@ -4,8 +4,6 @@ Closing pyrender's OpenGL display also closes MuJoCo's, and a faulty driver can 
 `surface_picture` runs this module as a program and returns None if the program fails.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What the figures of all reports share: files, axes, legends, hill shading."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Callable, Mapping

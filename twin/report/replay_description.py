@@ -1,7 +1,5 @@
 """Description of a replayed run in its run folder (scenario.resolved.toml): data set, settings and rectified rig."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple

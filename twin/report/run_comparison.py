@@ -3,8 +3,6 @@
 Each figure function returns None if no run has the data that its figure shows.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path

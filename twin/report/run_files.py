@@ -1,7 +1,5 @@
 """Validates the scenario and the JSON files of a run folder, which may have been edited since `twin run` wrote them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Reads a run folder. Only the scenario file is required; a folder without metrics.json is an unfinished survey."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

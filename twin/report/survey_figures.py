@@ -1,7 +1,5 @@
 """Figures of the survey report. Each figure function returns None if its data are missing from the run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ default share of the sky. The upwelling light is compared over a black floor and
 reference use the same absorption, scattering and phase function.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Results of one experiment as tables and figures, and the files that hold the results of experiments."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Each cell of the comparison has one water type, camera height, lamp arrangement 
 albedo, in the green band. Model and reference use the same absorption, scattering, phase function and lamps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import product
 

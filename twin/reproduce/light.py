@@ -1,7 +1,5 @@
 """Comparison of the light model of the images with a Monte Carlo of any order of scattering, in the green band."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path

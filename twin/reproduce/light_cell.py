@@ -1,7 +1,5 @@
 """Light by the light model and by the Monte Carlo reference in one situation: the records of all comparisons."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,7 +35,7 @@ class Compared(NamedTuple):
             return BatchMean(np.nan, np.nan)
         return BatchMean(self.truth.value / self.model, self.truth.standard_error / self.model)
 
-    def over(self, other: Compared) -> Compared:
+    def over(self, other: "Compared") -> "Compared":
         """Returns the quotient of two quantities, whose truths are independent."""
         value = self.truth.value / other.truth.value
         own, others = (one.truth.standard_error / one.truth.value for one in (self, other))

@@ -4,8 +4,6 @@ Motion between frames has to be computed within a frame period, and all work on 
 periods up to the next one.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Counterparts of Figs. 4 to 7 of Negahdaripour & Madjidi (2003)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ One lamp shines from port of a camera that points straight down, 2 m above the l
 one relief with a point of it: in a shadow, beside an edge of depth, or lit. Model and reference use the same heights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from itertools import product

@@ -1,7 +1,5 @@
 """Tank experiments of Negahdaripour & Madjidi (2003, section V-B): closure, sizes of objects, and predicted errors."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Surveys of the tank: the images that a rig on an overhead track takes, which is not straight, and the estimates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

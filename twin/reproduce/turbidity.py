@@ -1,7 +1,5 @@
 """One object at five turbidities (Fig. 8 of Negahdaripour & Madjidi 2003), and contrast as a function of range."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

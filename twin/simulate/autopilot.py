@@ -4,8 +4,6 @@ The controller is designed with the parameters of the vehicle and ignores the dr
 scenario, which therefore act as model errors. The top speed includes the drag factor, the loads include both factors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

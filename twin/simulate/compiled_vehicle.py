@@ -5,8 +5,6 @@ position with the new velocity and the rotation with the new angular velocity. T
 `mujoco_vehicle.MujocoVehicle` within rounding errors.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

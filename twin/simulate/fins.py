@@ -7,8 +7,6 @@ that of a flat plate; its drag is lift times tan alpha, that of a foil without s
 Borst 1985, ch. 17: a fin of small aspect ratio), an upper limit. The drag at zero lift is part of that of the hull.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Vehicle simulated by MuJoCo under a force that produces the acceleration of the hydrodynamic model."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Steady flight of a vehicle that is steered by fins: its trim on a level circle, minimum speed and turning radius."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

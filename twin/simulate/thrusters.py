@@ -1,7 +1,5 @@
 """Thruster model: steady thrust as a function of the command, and linear lag."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

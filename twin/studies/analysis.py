@@ -1,7 +1,5 @@
 """Statistical analysis of a study's results: pass probability, metrics, sensitivities and reasons for failure."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Verdicts on ranges of a key: where the pass probability is shown to reach, or to miss, the required one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple

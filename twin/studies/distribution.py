@@ -1,8 +1,6 @@
 """Probability distribution, or list of values, of one varied key of a study."""
 
-from __future__ import annotations
-
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +41,7 @@ class Distribution(Section):
         return given
 
     @model_validator(mode="after")
-    def _valid_parameters(self) -> Distribution:
+    def _valid_parameters(self) -> Self:
         if self.kind in _LAWS:
             rule, is_valid, _ = _LAWS[self.kind]
             if not is_valid(*self.values):

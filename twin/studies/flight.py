@@ -1,7 +1,5 @@
 """Flies one survey of a study, keeps the requested output files, and returns its row of results."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import time

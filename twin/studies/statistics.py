@@ -1,7 +1,5 @@
 """Statistics of a sample of surveys: proportions, quantiles, correlations and Sobol indices, with 95 % intervals."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from bisect import bisect_left

@@ -1,7 +1,5 @@
 """Surveys of a study: design points, samples of the varied keys, and the validated scenario of each sample."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable, Iterator, Mapping
 from itertools import product
 from pathlib import Path
