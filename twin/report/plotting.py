@@ -2,7 +2,9 @@
 
 import base64
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -23,6 +25,16 @@ def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> 
     with matplotlib.rc_context(FIGURE_STYLE):
         figures = {name: draw(*data) for name, draw in functions.items()}
         return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
+
+
+@contextmanager
+def png_figure(file: Path, width_in: float, height_in: float, grid: bool = True) -> Iterator[Figure]:
+    """Opens an empty figure in the style of the reports, and writes it to a PNG file at the end."""
+    with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": grid}):
+        figure = Figure(figsize=(width_in, height_in))
+        yield figure
+        file.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(file, format="png")
 
 
 def to_data_uri(figure: Figure) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from twin.judge.map_error import height_error
 from twin.judge.summary_statistics import percentile
 from twin.judge.trajectory_errors import path_errors
+from twin.report.plotting import png_figure
 from twin.report.style import COLOURS
 from twin.reproduce.exhibit import (
     DASH,
@@ -20,7 +21,6 @@ from twin.reproduce.exhibit import (
     Figure,
     Row,
     Table,
-    drawn,
     extent_of,
     make_table,
     millimetres,
@@ -156,7 +156,7 @@ LEAST_M, LARGEST_M = 2e-4, 0.1  # limits of the logarithmic scale of sigma and e
 
 
 def draw(title: str, survey: TankSurvey, file: Path) -> None:
-    with drawn(file, 13.0, 7.4) as figure:
+    with png_figure(file, 13.0, 7.4) as figure:
         figure.suptitle(title, fontsize=12)
         panels = figure.subplots(2, 3)
         _network(panels[0, 0], survey)

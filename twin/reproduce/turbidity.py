@@ -15,8 +15,8 @@ from twin.core.records import Image, StereoRig
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
 from twin.imaging.light.water import Medium
-from twin.report.plotting import log_axis
-from twin.reproduce.exhibit import Exhibit, Figure, drawn, make_table, write_json
+from twin.report.plotting import log_axis, png_figure
+from twin.reproduce.exhibit import Exhibit, Figure, make_table, write_json
 from twin.reproduce.experiment_floors import block_on_sand
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
@@ -149,7 +149,7 @@ def write(levels: Sequence[TurbidityLevel], folder: Path) -> dict[str, Any]:
 def draw(levels: Sequence[TurbidityLevel], file: Path) -> None:
     height, width = levels[0].image.shape[:2]
     image_in = PANEL_IN * height / width
-    with drawn(file, PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6) as figure:
+    with png_figure(file, PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6) as figure:
         grid = figure.add_gridspec(3, len(levels), height_ratios=[image_in, 1.6, 3.4])
         figure.suptitle(_title(levels), fontsize=12)
         top = max(_histogram_of(level.image, band).max() for level in levels for band in range(3))
