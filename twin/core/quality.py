@@ -5,9 +5,8 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
 
 
 class EpipolarError(NamedTuple):

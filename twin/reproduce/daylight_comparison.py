@@ -10,8 +10,8 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.imaging.light.daylight import DaylightVeil, floor_daylight
 from twin.imaging.light.illumination import Daylight, Illumination, daylight_at
@@ -39,8 +39,6 @@ from twin.reproduce.light_cell import (
     within,
 )  # fmt: skip
 from twin.scenario.model import SEA_WATER_INDEX, SunConfig, WaterConfig
-
-Array = NDArray[np.float64]
 
 WATERS, DEPTHS_M, RANGES_M, ELEVATIONS_DEG = ("IB", "II", "III", "1C", "3C"), (2.0, 5.0, 15.0), (1.0, 3.0), (90.0, 45.0)
 LIFT_M = 1e-3  # height of the slopes above the floor

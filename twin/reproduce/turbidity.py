@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from twin.app.look import image_quality, render_view
+from twin.core.geometry import Array
 from twin.core.records import Image, StereoRig
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
@@ -21,8 +21,6 @@ from twin.reproduce.experiment_floors import block_on_sand
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 from twin.world.mission import prepare
-
-Array = NDArray[np.float64]
 
 JERLOV = "II"
 TURBIDITIES = (0.0, 0.5, 1.5, 3.0, 6.0)  # values of `water.turbidity`

@@ -3,14 +3,13 @@
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtri
 
+from twin.core.geometry import Array
 from twin.scenario.model import Number, Section
 
-Array = NDArray[np.float64]
 Pair = tuple[Number, Number]
 Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 

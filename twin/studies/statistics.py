@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 from scipy.special import betaincinv, ndtri
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
+
 LEVEL = 0.95  #: confidence level of every interval
 RESAMPLES = 2000  #: number of resamples of every bootstrap
 _Z = float(ndtri(0.5 + LEVEL / 2))
