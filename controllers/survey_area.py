@@ -105,11 +105,6 @@ class SurveyArea:
         return ((((-half_u, -half_v), (half_u, -half_v), (half_u, half_v), (-half_u, half_v)),),)
 
 
-def polygon_area(corners_m: ArrayLike, heading: float) -> SurveyArea:
-    """Returns the area of one polygon without holes, with corners (n, 2): see `polygons_area`."""
-    return polygons_area([[corners_m]], heading)
-
-
 def polygons_area(polygons_m: Sequence[Sequence[ArrayLike]], heading: float) -> SurveyArea:
     """Returns the area of polygons in the scene [m], with legs along the heading [rad, counter-clockwise from east].
 
