@@ -10,13 +10,7 @@ import math
 
 from twin.controllers.segments import Circle, circle, max_circle_speed_mps
 from twin.controllers.survey_area import SurveyArea
-from twin.controllers.survey_plan import (
-    SurveyPlan,
-    SurveyRequest,
-    check_request,
-    frames_per_keyframe,
-    n_tracks_to_fly,
-)
+from twin.controllers.survey_plan import SurveyPlan, SurveyRequest, check_request, frames_per_keyframe, n_tracks_to_fly
 from twin.errors import TwinError
 
 

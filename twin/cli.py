@@ -60,8 +60,7 @@ RunOut = Annotated[Path | None, option("Folder to write. Default: runs/NAME-SEED
 OutFolder = Annotated[Path, option("Folder to write.")]
 Quick = Annotated[bool, option("Use smaller plans, images or selections of cases.", flag="--quick")]
 Jobs = Annotated[
-    int | None,
-    option("Parallel surveys, each a process or a SLURM job. Default: one per core.", min=1, max=1024),
+    int | None, option("Parallel surveys, each a process or a SLURM job. Default: one per core.", min=1, max=1024)
 ]
 Extrapolate = Annotated[
     bool,

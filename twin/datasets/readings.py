@@ -123,11 +123,7 @@ def in_body(inertial: SensorSeries, body_from_sensor: Array, errors: ImuErrorMod
 
 
 def vertical_series(
-    source: str,
-    inertial: SensorSeries,
-    body_from_sensor: Array,
-    errors: ImuErrorModel,
-    notes: list[str],
+    source: str, inertial: SensorSeries, body_from_sensor: Array, errors: ImuErrorModel, notes: list[str]
 ) -> SensorSeries | None:
     """Returns the direction of the vertical in body axes (unit vectors that point upwards) and its standard deviation.
 

@@ -21,11 +21,7 @@ class RunDescription(NamedTuple):
 
 
 def describe_replay(
-    name: str,
-    source: Mapping[str, Any],
-    rig: StereoRig,
-    settings: EstimatorSettings,
-    estimator: str | None = None,
+    name: str, source: Mapping[str, Any], rig: StereoRig, settings: EstimatorSettings, estimator: str | None = None
 ) -> RunDescription:
     """Returns the description of a replayed run: `source` (texts and numbers), rectified rig, and estimators."""
     tree = {

@@ -10,12 +10,7 @@ import numpy as np
 
 from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocation
 from twin.controllers.current_estimate import unknown_current
-from twin.controllers.tracking import (
-    ControllerState,
-    HullModel,
-    feedforward_wrench,
-    pole_placement_gains,
-)
+from twin.controllers.tracking import ControllerState, HullModel, feedforward_wrench, pole_placement_gains
 from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import trimmed_hull

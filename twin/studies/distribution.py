@@ -88,11 +88,7 @@ _LAWS: dict[str, tuple[Any, Any, Any]] = {
         lambda low, high: 0 < low < high,
         lambda p, low, high: np.exp(np.log(low) + np.log(high / low) * p),
     ),
-    "normal": (
-        "standard deviation > 0",
-        lambda _, sigma: sigma > 0,
-        lambda p, mean, sigma: mean + sigma * ndtri(p),
-    ),
+    "normal": ("standard deviation > 0", lambda _, sigma: sigma > 0, lambda p, mean, sigma: mean + sigma * ndtri(p)),
     "truncated_normal": (
         "standard deviation > 0, low < high",
         lambda _, sigma, low, high: sigma > 0 and low < high,
