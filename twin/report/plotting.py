@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from twin.core.georeference import Georeference
+from twin.core.records import MapGrid
 from twin.report.style import FIGURE_STYLE
 
 WIDTH_IN = 9.6
@@ -51,6 +52,11 @@ def one_panel(height_in: float) -> tuple[Figure, Axes]:
 
 def legend_beside(axes: Axes) -> None:
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
+
+
+def extent_of(grid: MapGrid) -> tuple[float, float, float, float]:
+    """Returns west, east, south and north of a grid [m], for pictures of it."""
+    return grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m
 
 
 def add_coordinates(axes: Axes, origin: Georeference | None) -> None:

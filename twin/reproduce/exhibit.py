@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.core.records import MapGrid
 from twin.core.user_files import read_json
 from twin.errors import TwinError
 from twin.report.html import render_page
@@ -47,11 +46,6 @@ class Exhibit(NamedTuple):
 
 def make_table(key: str, title: str, rows: Sequence[Sequence[str]]) -> Table:
     return Table(key, title, tuple(tuple(row) for row in rows))
-
-
-def extent_of(grid: MapGrid) -> tuple[float, float, float, float]:
-    """Returns west, east, south and north of a grid [m], for pictures of it."""
-    return grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m
 
 
 def write_json(file: Path, contents: Any) -> None:

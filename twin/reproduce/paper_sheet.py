@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from twin.judge.map_error import height_error
 from twin.judge.trajectory_errors import keyframe_errors_m, path_errors
-from twin.report.plotting import hillshade, log_axis, png_figure
+from twin.report.plotting import extent_of, hillshade, log_axis, png_figure
 from twin.report.style import COLOURS
-from twin.reproduce.exhibit import extent_of
 from twin.reproduce.paper_flight import Flown
 
 SHADES = ("#d55e00", "#0072b2")  # coarse texture, full resolution

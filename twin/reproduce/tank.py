@@ -13,20 +13,9 @@ from numpy.typing import NDArray
 from twin.judge.map_error import height_error
 from twin.judge.summary_statistics import percentile
 from twin.judge.trajectory_errors import path_errors
-from twin.report.plotting import png_figure
+from twin.report.plotting import extent_of, png_figure
 from twin.report.style import COLOURS
-from twin.reproduce.exhibit import (
-    DASH,
-    Exhibit,
-    Figure,
-    Row,
-    Table,
-    extent_of,
-    make_table,
-    millimetres,
-    percent,
-    write_exhibit,
-)
+from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
 from twin.reproduce.experiment_floors import OBJECTS
 from twin.reproduce.tank_sizes import SizeRow, hidden_cells, measure
 from twin.reproduce.tank_survey import QUICK, TankSurvey, closures, height_errors, survey_tank
