@@ -62,10 +62,6 @@ def checked_index(index: Any) -> dict[str, Any]:
     return index
 
 
-def checked_environment(environment: Any) -> dict[str, Any]:
-    return conform(environment, {})
-
-
 def checked_scenario(scenario: Any) -> dict[str, Any]:
     template = Scenario().model_dump(mode="json", exclude_none=True)  # a key without a default may have any value
     return conform(scenario, template | {"lamps": [], "beacons": []})

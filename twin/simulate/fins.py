@@ -50,7 +50,7 @@ def fins_of(vehicle: VehicleConfig, timestep_s: float) -> Fins:
 
 
 @kernel
-def set_fin_commands(fins, command):
+def command_fins(fins, command):
     """Sets the commands (m,) of the m movable fins, clipped to [-1, 1], for the following steps."""
     k = 0
     for n in range(len(fins.max_rad)):
