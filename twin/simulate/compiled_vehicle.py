@@ -70,23 +70,11 @@ class CompiledVehicle:
             fins_of(vehicle, timestep_s), trimmed_hull(vehicle), sea, timestep_s, np.zeros(1, np.int64), floor, tether,
             np.full(1, -1),
         )  # fmt: skip
-        self._time_s = 0.0
+        self.sea, self.tether, self.thrusters, self._time_s = sea, tether, thrusters, 0.0
 
     @property
     def world_from_body(self) -> Array:
         return self.state.pose.copy()
-
-    @property
-    def tether(self) -> Tether:
-        return self.state.tether
-
-    @property
-    def sea(self) -> Sea:
-        return self.state.sea
-
-    @property
-    def thrusters(self) -> ThrusterState:
-        return self.state.thrusters
 
     @property
     def twist_body(self) -> Array:
