@@ -31,7 +31,7 @@ def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> 
 @contextmanager
 def png_figure(file: Path, width_in: float, height_in: float, grid: bool = True) -> Iterator[Figure]:
     """Opens an empty figure in the style of the reports, and writes it to a PNG file at the end."""
-    with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": grid}):
+    with matplotlib.rc_context({**FIGURE_STYLE, "axes.grid": grid}):
         figure = Figure(figsize=(width_in, height_in))
         yield figure
         file.parent.mkdir(parents=True, exist_ok=True)
