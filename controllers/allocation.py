@@ -1,7 +1,5 @@
 """Thrust allocation: converts a wrench on the body to thruster commands."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -33,24 +31,19 @@ def allocate_wrench(allocation, wrench):
     return np.interp(thrusts / load, table, allocation.command_table), 1 / load
 
 
-def pseudo_inverse_allocation(
-    configuration: Array, thrust_of_command: Callable[[Array], Array], weights: Array | None = None
-) -> ThrustAllocation:
-    """Returns the allocation by the weighted pseudo-inverse of the thrust configuration matrix.
+def pseudo_inverse_allocation(configuration: Array, thrust_of_command: Callable[[Array], Array]) -> ThrustAllocation:
+    """Returns the allocation by the pseudo-inverse of the thrust configuration matrix.
 
-    The thrusts f = W^-1 B' (B W^-1 B')^-1 tau minimise f' W f subject to B f = tau (Fossen 2011, section 12.3). Where
-    the thrusters cannot produce all wrenches, they produce the part of tau that they can (generalised inverse).
+    The thrusts f = B' (B B')^-1 tau minimise f' f subject to B f = tau (Fossen 2011, section 12.3). Where the thrusters
+    cannot produce all wrenches, they produce the part of tau that they can (generalised inverse).
 
     Args:
         configuration: thrust configuration matrix B (6, n): wrench [moment, force] in the body per newton of thrust.
         thrust_of_command: returns the steady thrust [N] at commands in [-1, 1], increasing around 0.
-        weights: diagonal of W (n,); a thruster with a greater weight is used less. None: equal weights.
     """
-    weighted = configuration / (np.ones(configuration.shape[1]) if weights is None else weights)
-    square = configuration @ weighted.T
-    inverse = weighted.T @ (
-        np.linalg.inv(square) if np.linalg.matrix_rank(configuration) == 6 else np.linalg.pinv(square)
-    )
+    square = configuration @ configuration.T
+    is_full = np.linalg.matrix_rank(configuration) == 6
+    inverse = configuration.T @ (np.linalg.inv(square) if is_full else np.linalg.pinv(square))
     command = np.linspace(-1, 1, 2001)
     thrust = thrust_of_command(command)
     # The fitted thrust curve decreases near full command: only its increasing part can be inverted.

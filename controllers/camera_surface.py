@@ -1,7 +1,5 @@
 """Planned height of the camera on a path that follows the floor: a smooth surface over the axes (u, v) of the legs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Estimate of the horizontal current from thrust and motion, for the feed-forward of the pose controller."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Curves of a path that is flown at constant speed, bow first: the curvature changes continuously along them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Detours of a survey: tracks away from its legs, after which the vehicle returns to where it left (P27)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

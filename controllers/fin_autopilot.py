@@ -4,8 +4,6 @@ Feed-forward of the trim on a circle of the curvature of the path, and linear st
 with integral action. The bow points along the planned velocity through the estimated current.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core import geometry

@@ -1,7 +1,5 @@
 """Forecast of a survey plan: keyframes, duration, overlaps, depth noise and clearance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

@@ -7,8 +7,6 @@ swaths along the image width. With "arcs", it flies all legs bow first at consta
 Cross lines, which check the legs, are a last track: the vehicle flies them sideways.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import accumulate, pairwise

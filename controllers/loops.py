@@ -6,19 +6,11 @@ is known, so drift does not accumulate from loop to loop. The bow always points 
 first loop (east if the heading is 0).
 """
 
-from __future__ import annotations
-
 import math
 
 from twin.controllers.segments import Circle, circle, max_circle_speed_mps
 from twin.controllers.survey_area import SurveyArea
-from twin.controllers.survey_plan import (
-    SurveyPlan,
-    SurveyRequest,
-    check_request,
-    frames_per_keyframe,
-    n_tracks_to_fly,
-)
+from twin.controllers.survey_plan import SurveyPlan, SurveyRequest, check_request, frames_per_keyframe, n_tracks_to_fly
 from twin.errors import TwinError
 
 

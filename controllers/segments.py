@@ -1,7 +1,5 @@
 """Segments of a planned path: straight lines, full circles and turns on the spot, each flown from rest to rest."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,7 +55,7 @@ class Reference(NamedTuple):
     yaw: Array | float
     acceleration: Array
 
-    def row(self, k: int) -> Reference:
+    def row(self, k: int) -> "Reference":
         return Reference(*(part[k] for part in self))  # type: ignore[index]
 
 

@@ -4,8 +4,6 @@ Plans are made in the axes of the legs: u along the legs and v to the left of th
 area's extent. `SurveyArea` converts between (u, v) and the scene coordinates (x, y).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -105,11 +103,6 @@ class SurveyArea:
             return self.polygons
         half_u, half_v = self.size_m[0] / 2, self.size_m[1] / 2
         return ((((-half_u, -half_v), (half_u, -half_v), (half_u, half_v), (-half_u, half_v)),),)
-
-
-def polygon_area(corners_m: ArrayLike, heading: float) -> SurveyArea:
-    """Returns the area of one polygon without holes, with corners (n, 2): see `polygons_area`."""
-    return polygons_area([[corners_m]], heading)
 
 
 def polygons_area(polygons_m: Sequence[Sequence[ArrayLike]], heading: float) -> SurveyArea:

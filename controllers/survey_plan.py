@@ -1,7 +1,5 @@
 """Requirements of a survey, and the plan that meets them: the path of every track and the spacing, for any pattern."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -226,9 +224,7 @@ def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
     if n < 1:
         fastest = 2 * advance_m * request.frame_rate_hz
         raise TwinError(
-            "plan.speed_mps",
-            f"{speed_mps:g} is too fast: less than one frame per keyframe",
-            f"below {fastest:.3g}",
+            "plan.speed_mps", f"{speed_mps:g} is too fast: less than one frame per keyframe", f"below {fastest:.3g}"
         )
     return n
 

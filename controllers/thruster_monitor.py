@@ -1,7 +1,5 @@
 """Thruster monitor: finds thrusters whose reported thrust is not that of their commands."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

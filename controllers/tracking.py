@@ -1,7 +1,5 @@
 """Trajectory tracking and station keeping: computes thruster commands from the estimated pose and velocity."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

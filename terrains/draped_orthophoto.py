@@ -1,7 +1,5 @@
 """Texture from an orthophoto: a GeoTIFF with its own coordinate reference system (CRS), resolution and extent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +12,11 @@ from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
 from twin.core.georeference import Georeference
+from twin.core.records import Image
 from twin.core.user_files import open_raster
 from twin.errors import TwinError
 from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_count, eight_bits
 
-Image = NDArray[np.uint8]
 Bounds = tuple[float, float, float, float]  #: west, south, east, north in a CRS
 
 _FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"

@@ -1,7 +1,5 @@
 """Heights, grid, coordinate reference system (CRS) and vertical axis of a GeoTIFF, or of a grid as text."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Images and heights in files: limits on their size, checked with the header before the contents are read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

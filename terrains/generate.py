@@ -1,7 +1,5 @@
 """Procedural terrains: flat, sand ripples, fractal ground, coral reef, cliffs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

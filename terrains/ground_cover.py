@@ -1,7 +1,5 @@
 """Materials of generated floors: ramps of colours from dark to bright, and structures that move texels along them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

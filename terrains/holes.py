@@ -1,7 +1,5 @@
 """Cells of a height file without a height."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

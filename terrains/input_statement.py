@@ -1,7 +1,5 @@
 """Statement of how the files of a floor were read."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

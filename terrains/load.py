@@ -1,7 +1,5 @@
 """Terrains from files: heights from GeoTIFF, text grids, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

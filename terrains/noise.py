@@ -4,8 +4,6 @@ The functions of position (value, fractal and cellular noise) take a lattice of 
 `layer`, and are periodic with LATTICE lattice spacings. Cellular noise: Worley 1996, A cellular texture basis function.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -5,14 +5,11 @@ of the photo where it agrees well with the previous blocks in the overlap, and i
 difference through the overlap (Efros & Freeman 2001, Image quilting for texture synthesis and transfer, sec. 2).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.records import Image
 from twin.kernels import kernel
-
-Image = NDArray[np.uint8]
 
 BLOCK_FRACTION = 5  #: shorter side of the photo divided by the side of a block
 OVERLAP_FRACTION = 4  #: side of a block divided by the overlap of neighbouring blocks

@@ -1,7 +1,5 @@
 """Seafloor model: a triangulated height grid with a texture."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

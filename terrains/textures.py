@@ -1,7 +1,5 @@
 """Seafloor textures: generated from materials such as sand, rock and coral, or made from a photo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,13 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.records import Image
 from twin.errors import TwinError
 from twin.terrains.file_header import TEXTURE_FIELD, decoded, eight_bits
 from twin.terrains.ground_cover import COVERS, paint
 from twin.terrains.noise import fractal_field, pink_noise
 from twin.terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
-
-Image = NDArray[np.uint8]
 
 _PHOTOS = "a PNG, JPEG, TIFF, BMP or WebP image"
 COARSEN_TEXELS = 40_000_000  #: largest number of texels of a floor with `TextureSource.coarsen`

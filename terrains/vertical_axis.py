@@ -1,7 +1,5 @@
 """What a height file states: direction and unit of its values, CRS. `terrain.z` may give the direction."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Literal, NamedTuple

@@ -7,16 +7,13 @@ to 1 at 65 deg. With the unit normal n, it is divided between them in proportion
 2007, GPU Gems 3, sec. 1.5).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from twin.core.records import Mask
 from twin.terrains.terrain import Walls
 from twin.terrains.textures import TextureSource, generate_wall_texture, texture_from_photo
-
-Mask = NDArray[np.bool_]
 
 #: Cosines of the slope from which on walls have a texture of their own (50 deg), and no other (65 deg).
 STEEP_COSINE, WALL_COSINE = 0.643, 0.423

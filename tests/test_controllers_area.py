@@ -13,7 +13,7 @@ from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import surface_above_floor
 from twin.controllers.forecast import least_clearance
 from twin.controllers.segments import Turn
-from twin.controllers.survey_area import SurveyArea, polygon_area, polygons_area
+from twin.controllers.survey_area import SurveyArea, polygons_area
 from twin.controllers.survey_plan import TURN_PER_KEYFRAME, TURN_RATE, SurveyRequest
 from twin.errors import TwinError
 
@@ -40,6 +40,10 @@ def plan(area=None, **changes):
 
 def rectangle(size_m=(4.0, 3.0), centre_m=(0.0, 0.0), heading_deg=0.0):
     return SurveyArea("rectangle", size_m, centre_m, np.deg2rad(heading_deg))
+
+
+def polygon_area(corners, heading):
+    return polygons_area([[corners]], heading)
 
 
 def legs_of(p):

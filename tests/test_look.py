@@ -141,7 +141,8 @@ def test_a_panel_states_that_its_brightness_is_that_before_tone_curve_and_white_
 @pytest.mark.parametrize("settings", [["water.jerlov=clear"], ["water.jerlov=9C"], [*EFFECTS, *PHYSICAL]])
 def test_the_sheet_is_a_picture(tmp_path, settings):
     here = mission(*settings)
-    file = look_sheet.draw(here.scenario, render_view(here), tmp_path / "below" / "sheet.png")
+    file = tmp_path / "below" / "sheet.png"
+    look_sheet.draw(here.scenario, render_view(here), file)
     picture = cv2.imread(str(file))
     assert picture is not None and picture.shape[1] > 1000
 

@@ -15,7 +15,7 @@ from twin.simulate.echo_sounders import BottomLock
 from twin.simulate.parameters import parameters_of
 from twin.simulate.reading_times import Delays
 from twin.simulate.sensors import NavigationSensors
-from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, steady_thrust_n, step_thrusters
+from twin.simulate.thrusters import command_thrusters, lagged_thrusters, steady_thrust_n, step_thrusters
 
 ROV = parameters_of(VehicleConfig())
 NOISE = SensorNoise(pressure_m=0.02, attitude_rad=0.003, heading_rad=0.01)
@@ -40,7 +40,7 @@ def readings_at(pose, aiding, n, seed=0, noise=NOISE, velocity=(0.0, 0.0, 0.0), 
 def test_a_command_step_gives_the_step_response_of_the_published_lag():
     step_s, command = 1 / 120, np.linspace(-1, 1, 8)
     thrusters = lagged_thrusters(ROV, step_s)
-    set_thruster_command(thrusters, command)
+    command_thrusters(thrusters, command)
     history = []
     for _ in range(120):
         history.append(thrusters.c @ thrusters.lag_state)

@@ -1,7 +1,5 @@
 """Digital twin of an underwater stereo survey: simulation, estimators, and evaluation against the truth."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from twin.api import compare, export, load_run, load_scenario, look, plan, replay, run, study, tune, vehicle

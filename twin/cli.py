@@ -67,8 +67,7 @@ CheckpointS = Annotated[
 OutFolder = Annotated[Path, option("Folder to write.")]
 Quick = Annotated[bool, option("Use smaller plans, images or selections of cases.", flag="--quick")]
 Jobs = Annotated[
-    int | None,
-    option("Parallel surveys, each a process or a SLURM job. Default: one per core.", min=1, max=1024),
+    int | None, option("Parallel surveys, each a process or a SLURM job. Default: one per core.", min=1, max=1024)
 ]
 Extrapolate = Annotated[
     bool,
@@ -194,11 +193,8 @@ def vehicle(
     scenario = api.load_scenario(scene, overrides, allow_plugins)
     file = out or Path(f"runs/{outputs.file_stem(scenario.name)}-vehicle.png")
     limits = api.vehicle(scenario, file)
-    if as_json:
-        print(json.dumps(vehicle_limits.as_json(limits, str(file)), indent=1))
-    else:
-        console.print_table(f"Vehicle of {scenario.name}: {limits.title}", vehicle_limits.rows(limits))
-        print(f"Picture: {file}")
+    tree, table = vehicle_limits.as_json(limits, str(file)), vehicle_limits.rows(limits)
+    _show(as_json, tree, [(f"Vehicle of {scenario.name}: {limits.title}", table)], f"Picture: {file}")
 
 
 @app.command()

@@ -3,8 +3,6 @@
 Importing this module registers the environment. It needs the extra `gym` of the package.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, SupportsFloat
 
@@ -33,7 +31,47 @@ YAW_RATE_RADPS, SPEED_RATIO = 0.5, 1.5
 Observation = dict[str, Any]
 
 
-class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class _SurveyEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """What both environments share: the world, the action and the target of the controller."""
+
+    def __init__(self, given: Scenario, action: str):
+        _check_action(given, action)
+        self.world, self._velocity_action = SteppedWorld(given), action == "velocity"
+        self._most_mps = SPEED_RATIO * given.plan.speed_mps
+        n = 4 if self._velocity_action else given.vehicle.n_commands
+        self.action_space = spaces.Box(-1.0, 1.0, (n,), np.float32)
+
+    def close(self) -> None:
+        """Ends the episode: closes the estimators."""
+        self.world.close()
+
+    @property
+    def distance_m(self) -> float:
+        """Returns the distance of the left camera from its planned position [m]."""
+        return float(np.linalg.norm(self.world.true_pose[:3, 3] - self.world.reference.position))
+
+    def _start(self) -> None:
+        self._frame = self.world.reset(int(self.np_random.integers(2**31)))
+        self._steer, start = make_pilot(self.world.mission), self.world.reference
+        self._target = Reference(start.position.copy(), np.zeros(3), float(start.yaw), np.zeros(3))
+
+    def _command(self, values: Array) -> Array:
+        """Returns the command of the vehicle for one frame; a velocity also moves the target of the controller."""
+        if not self._velocity_action:
+            return values
+        self._target = moved(self._target, values, self._most_mps, 1 / self.world.rig.frame_rate_hz)
+        return self._steer(self._seen_by_controller(), self._target)
+
+    def _seen_by_controller(self) -> Estimate:
+        raise NotImplementedError
+
+    def _departure(self) -> str:
+        """Returns the reason for the end of the episode if the camera is outside of the terrain, otherwise ""."""
+        x, y = self.world.true_pose[:2, 3]
+        return "the camera left the terrain" if np.isnan(self.world.mission.terrain.height_at(x, y)) else ""
+
+
+class SeabedTwinEnv(_SurveyEnv):
     """Survey of a scenario as a reinforcement-learning environment.
 
     A step lasts from one keyframe to the next: `frames_per_step` frames, the last of which has both images. The
@@ -85,16 +123,11 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         given = load_scenario(scenario, overrides, allow_plugins)
         if given.imaging.fidelity != "rendered":
             raise TwinError("imaging.fidelity", f"{given.imaging.fidelity!r} has no images", '"rendered"')
-        _check_action(given, action)
         if reward not in ("coverage", "track"):
             raise TwinError("reward", f"{reward!r}: no such reward", '"coverage" or "track"')
-        self._world = SteppedWorld(given)
-        self._velocity_action, self._reward, self.render_mode = action == "velocity", reward, render_mode
-        self._most_mps = SPEED_RATIO * given.plan.speed_mps
-        self.action_space = spaces.Box(
-            -1.0, 1.0, (4 if self._velocity_action else given.vehicle.n_commands,), np.float32
-        )
-        shape = (self._world.rig.height_px, self._world.rig.width_px, 3)
+        super().__init__(given, action)
+        self._reward, self.render_mode = reward, render_mode
+        shape = (self.world.rig.height_px, self.world.rig.width_px, 3)
         images = {name: spaces.Box(0, 255, shape, np.uint8) for name in ("left", "right")}
         numbers = {
             name: spaces.Box(-np.inf, np.inf, (n,), np.float64)
@@ -105,7 +138,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     @property
     def frames_per_step(self) -> int:
         """Returns the number of frames of a step. It depends on the floor, and thus on the seed of the scenario."""
-        return self._world.mission.plan.n_frames_per_keyframe
+        return self.world.mission.plan.n_frames_per_keyframe
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -116,14 +149,11 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         restarts. Raises ScenarioError if the survey cannot be flown with it, TwinError if the world cannot be created.
         """
         super().reset(seed=seed)
-        self._frame = self._world.reset(int(self.np_random.integers(2**31)))
-        self._navigator = self._world.estimator()
-        self._steer = make_pilot(self._world.mission)
+        self._start()
+        self._navigator = self.world.estimator()
         self._estimate = self._navigator.update(self._frame, 1)
-        start = self._world.reference
-        self._target = Reference(start.position.copy(), np.zeros(3), float(start.yaw), np.zeros(3))
-        grid = self._world.mission.grid
-        self._asked = self._world.mission.asked(*np.meshgrid(*grid.centres()))
+        grid = self.world.mission.grid
+        self._asked = self.world.mission.asked(*np.meshgrid(*grid.centres()))
         self._covered_m2 = self._seen_m2()
         self._ended = ""
         return self._observation(), self._info()
@@ -134,20 +164,20 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         truncated = False
         try:
             for k in range(self.frames_per_step):
-                frame = self._world.step(self._command(values), keyframe=k + 1 == self.frames_per_step)
+                frame = self.world.step(self._command(values), keyframe=k + 1 == self.frames_per_step)
                 if frame is None:
                     truncated = True
                     break
                 self._frame = frame
-                if self._world.aligns:
-                    self._navigator.align_track(self._world.track)
-                self._estimate = self._navigator.update(frame, self._world.track)
+                if self.world.aligns:
+                    self._navigator.align_track(self.world.track)
+                self._estimate = self._navigator.update(frame, self.world.track)
         except SurveyAborted as error:
             self._ended = str(error)
         self._ended = self._ended or self._departure()
         seen_m2 = self._seen_m2()
         gained_m2, self._covered_m2 = seen_m2 - self._covered_m2, seen_m2
-        reward = gained_m2 if self._reward == "coverage" else -self._distance_to_plan_m()
+        reward = gained_m2 if self._reward == "coverage" else -self.distance_m
         return self._observation(), reward, bool(self._ended), truncated, self._info()
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -156,20 +186,11 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             return None
         return np.concatenate([self._frame.left, self._right()], axis=1)
 
-    def close(self) -> None:
-        """Ends the episode: closes the estimators."""
-        self._world.close()
-
-    def _command(self, values: Array) -> Array:
-        """Returns the command of the vehicle for one frame; a velocity also moves the target of the controller."""
-        if not self._velocity_action:
-            return values
-        self._target = moved(self._target, values, self._most_mps, 1 / self._world.rig.frame_rate_hz)
-        estimate = without_feedback(self._estimate, self._target, self._frame.readings)
-        return self._steer(estimate, self._target)
+    def _seen_by_controller(self) -> Estimate:
+        return without_feedback(self._estimate, self._target, self._frame.readings)
 
     def _observation(self) -> Observation:
-        reference, pose = self._world.reference, self._estimate.world_from_camera
+        reference, pose = self.world.reference, self._estimate.world_from_camera
         readings, available = _readings(self._frame)
         return {
             "left": self._frame.left,
@@ -182,29 +203,22 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _right(self) -> NDArray[np.uint8]:
         """Returns the right image; at a frame without one, that of an extra exposure (`SteppedWorld.capture`)."""
-        return self._world.capture().right if self._frame.right is None else self._frame.right
+        return self.world.capture().right if self._frame.right is None else self._frame.right
 
     def _info(self) -> dict[str, Any]:
-        asked_m2 = float(self._asked.sum()) * self._world.mission.grid.cell_m**2
+        asked_m2 = float(self._asked.sum()) * self.world.mission.grid.cell_m**2
         truth = {
-            "world_from_camera": self._world.true_pose,
-            "distance_to_plan_m": self._distance_to_plan_m(),
+            "world_from_camera": self.world.true_pose,
+            "distance_to_plan_m": self.distance_m,
             "covered": self._covered_m2 / asked_m2,
         }
         return {"time_s": self._frame.time_s, "truth": truth, "ended": self._ended}
 
-    def _distance_to_plan_m(self) -> float:
-        return float(np.linalg.norm(self._world.true_pose[:3, 3] - self._world.reference.position))
-
     def _seen_m2(self) -> float:
-        return float((self._world.world.seen() & self._asked).sum()) * self._world.mission.grid.cell_m**2
-
-    def _departure(self) -> str:
-        x, y = self._world.true_pose[:2, 3]
-        return "the camera left the terrain" if np.isnan(self._world.mission.terrain.height_at(x, y)) else ""
+        return float((self.world.world.seen() & self._asked).sum()) * self.world.mission.grid.cell_m**2
 
 
-class SeabedTwinStateEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class SeabedTwinStateEnv(_SurveyEnv):
     """Vehicle of a scenario by its true state, without images and estimators: thousands of steps a second.
 
     A step lasts `frames` frames. An episode is truncated after the last frame of the plan, and terminated if the hull
@@ -236,7 +250,7 @@ class SeabedTwinStateEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         overrides: Sequence[str] = (),
         action: Literal["velocity", "thrust"] = "velocity",
         observe: Sequence[str] = ("pose", "velocity", "reference"),
-        reward: Literal["track"] | Callable[[SeabedTwinStateEnv], float] = "track",
+        reward: Literal["track"] | Callable[["SeabedTwinStateEnv"], float] = "track",
         frames: int = 1,
         allow_plugins: bool = False,
     ):
@@ -246,13 +260,9 @@ class SeabedTwinStateEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise TwinError("observe", f"{unknown[0]!r}: no such observation", ", ".join(_BOUNDS))
         if frames < 1:
             raise TwinError("frames", f"{frames}", "1 or more")
-        _check_action(given, action)
-        self.world, self._observe, self._frames = SteppedWorld(given), tuple(observe), frames
-        self._velocity_action = action == "velocity"
-        self._reward = reward if callable(reward) else _minus_distance
-        self._most_mps = SPEED_RATIO * given.plan.speed_mps
-        self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else given.vehicle.n_commands,))
-        self._limits = {name: np.array(_BOUNDS[name], np.float64) for name in self._observe}
+        super().__init__(given, action)
+        self._reward, self._frames = reward, frames
+        self._limits = {name: np.array(_BOUNDS[name], np.float64) for name in observe}
         self.observation_space = spaces.Dict({n: spaces.Box(-b, b, dtype=np.float64) for n, b in self._limits.items()})
 
     def reset(
@@ -260,9 +270,7 @@ class SeabedTwinStateEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Starts an episode, as `SeabedTwinEnv.reset`."""
         super().reset(seed=seed)
-        self._frame = self.world.reset(int(self.np_random.integers(2**31)))
-        self._steer, start = make_pilot(self.world.mission), self.world.reference
-        self._target = Reference(start.position.copy(), np.zeros(3), float(start.yaw), np.zeros(3))
+        self._start()
         self._to_camera = geometry.adjoint(geometry.inverse(self.world.rig.body_from_camera))
         return self._observation(), {"time_s": self._frame.time_s, "ended": ""}
 
@@ -277,31 +285,13 @@ class SeabedTwinStateEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
                 self._frame = frame
         except SurveyAborted as error:
             ended = str(error)
-        x, y = self.world.true_pose[:2, 3]
-        if not ended and np.isnan(self.world.mission.terrain.height_at(x, y)):
-            ended = "the camera left the terrain"
-        return (
-            self._observation(),
-            self._reward(self),
-            bool(ended),
-            truncated,
-            {"time_s": self._frame.time_s, "ended": ended},
-        )
+        ended = ended or self._departure()
+        reward = self._reward(self) if callable(self._reward) else -self.distance_m
+        return self._observation(), reward, bool(ended), truncated, {"time_s": self._frame.time_s, "ended": ended}
 
-    def close(self) -> None:
-        self.world.close()
-
-    @property
-    def distance_m(self) -> float:
-        """Returns the distance of the left camera from its planned position [m]."""
-        return float(np.linalg.norm(self.world.true_pose[:3, 3] - self.world.reference.position))
-
-    def _command(self, values: Array) -> Array:
-        if not self._velocity_action:
-            return values
-        self._target = moved(self._target, values, self._most_mps, 1 / self.world.rig.frame_rate_hz)
+    def _seen_by_controller(self) -> Estimate:
         pose, twist = self.world.true_pose, self._to_camera @ self.world.world.vehicle.twist_body
-        return self._steer(Estimate(self._frame.time_s, pose, pose, twist, 0.0, "ok"), self._target)
+        return Estimate(self._frame.time_s, pose, pose, twist, 0.0, "ok")
 
     def _observation(self) -> Observation:
         pose, reference = self.world.true_pose, self.world.reference
@@ -324,10 +314,6 @@ _BOUNDS: dict[str, Sequence[float]] = {
     "readings": [1e3, *[4.0] * 3, *[10.0] * 3],
     "available": [1.0] * 3,
 }
-
-
-def _minus_distance(env: SeabedTwinStateEnv) -> float:
-    return -env.distance_m
 
 
 def moved(last: Reference, values: Array, most_mps: float, interval_s: float) -> Reference:

@@ -1,7 +1,5 @@
 """Triangle meshes with one colour per vertex: the form of all objects, whether built in or read from a file."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -8,8 +8,6 @@ A part is a run of consecutive triangles, which are neighbours in the built-in s
 are a box and a cone that contains the normals of its triangles (Shirman & Abi-Ezzi 1993).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

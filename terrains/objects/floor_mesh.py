@@ -4,8 +4,6 @@ Only tiles in view are drawn. All levels of detail of a tile have its full geome
 tiles; the coarser levels have smoother colours, which filters the colours of vertices as a mip map filters a texture.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Meshes from files: PLY, OBJ and GLB, with the colours of their vertices or their texture."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager

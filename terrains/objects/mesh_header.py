@@ -1,7 +1,5 @@
 """Number of triangles that a mesh file declares, found without loading the mesh, because it may be very large."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections import Counter

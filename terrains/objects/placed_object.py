@@ -1,7 +1,5 @@
 """Objects ready for rendering: models with levels of detail, and objects placed in the world."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

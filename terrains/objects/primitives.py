@@ -1,7 +1,5 @@
 """Surfaces that built-in shapes are made of, and three-dimensional noise for their relief and colour."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

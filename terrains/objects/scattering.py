@@ -1,7 +1,5 @@
 """Positions of objects on a floor: one at a given position, or many scattered as a Poisson disc sample."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

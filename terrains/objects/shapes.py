@@ -1,7 +1,5 @@
 """Built-in shapes, about 1 in extent, made from the albedo (3,) for R, G, B and a random generator."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

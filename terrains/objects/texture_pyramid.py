@@ -1,7 +1,5 @@
 """Textures with levels of resolution (mip maps, Williams 1983), all in one array, from which a kernel samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

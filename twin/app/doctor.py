@@ -1,7 +1,5 @@
 """Checks of this machine (Python, packages, disk space, processors, OpenGL), with a remedy for each failure."""
 
-from __future__ import annotations
-
 import os
 import platform
 import shutil

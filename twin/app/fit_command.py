@@ -1,7 +1,5 @@
 """Command `twin fit-surrogate`: fits the surrogate's error model to rendered surveys."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

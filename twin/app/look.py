@@ -1,7 +1,5 @@
 """Rendering of one stereo pair without a survey; light components and quality measures of its left image."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import cv2

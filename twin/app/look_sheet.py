@@ -1,22 +1,17 @@
 """Contact sheet of `twin look`: stereo pair and light components of the left image, with units and value ranges."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from twin.app.look import ViewLayers
 from twin.imaging.light.optics import range_of
 from twin.imaging.light.water import clarity
 from twin.report.number_formats import DASH
-from twin.report.style import FIGURE_STYLE
+from twin.report.plotting import png_figure
 from twin.scenario.model import Scenario
 
 PANEL_IN = 3.5
@@ -35,24 +30,19 @@ class Panel(NamedTuple):
     colours: tuple[str, float, float] = ("viridis", 0.0, 1.0)
 
 
-def draw(scenario: Scenario, view: ViewLayers, file: Path) -> Path:
+def draw(scenario: Scenario, view: ViewLayers, file: Path) -> None:
     panels = _panels(scenario, view)
     columns = 4 if len(panels) <= 8 else 5
     rows = -(-len(panels) // columns)
     height, width = view.stereo_pair.depth_left.shape
-    size_in = (columns * PANEL_IN, 0.5 + rows * (PANEL_IN * height / width + 0.42))
-    style: dict[Any, Any] = {**FIGURE_STYLE, "axes.grid": False}
-    with matplotlib.rc_context(style):
-        figure = Figure(figsize=size_in)
+    height_in = 0.5 + rows * (PANEL_IN * height / width + 0.42)
+    with png_figure(file, columns * PANEL_IN, height_in, grid=False) as figure:
         figure.suptitle(_headline(scenario, view), fontsize=11)
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in grid:
             axes.set_axis_off()
         for axes, panel in zip(grid, panels, strict=False):
             _draw_panel(axes, panel)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        FigureCanvasAgg(figure).print_png(str(file))
-    return file
 
 
 def _headline(scenario: Scenario, view: ViewLayers) -> str:

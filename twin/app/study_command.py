@@ -1,7 +1,5 @@
 """Commands `twin study` and `twin tune`."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

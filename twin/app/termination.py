@@ -1,7 +1,5 @@
 """Handling of SIGTERM, sent e.g. by a batch system: it ends a survey in the same way as Ctrl-C."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Quantiles of the chi-square distribution, without `scipy.stats`, whose import takes half a second."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numpy.typing import ArrayLike

@@ -8,8 +8,6 @@ World: x east, y north, z up. Body: x forward, y left, z up. Camera: x right, y 
 centre of the top-left pixel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Georeference of a scene: where its origin lies in the coordinate reference system (CRS) of a measured DEM."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Floor as heights on a regular grid, whose cells are split along the diagonal from south-west to north-east."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled kernels that interpolate between the pixels of an image; fractions between two samples are in [0, 1)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.kernels import kernel

@@ -1,7 +1,5 @@
 """Handling of interrupts (Ctrl-C, SIGTERM), which end only the current stage of a survey; later stages still run."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Callable, Iterator

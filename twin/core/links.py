@@ -1,7 +1,5 @@
 """Measured motions between nodes of the keyframe network: a single link, and a sequence of links as arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, overload
 
@@ -61,13 +59,13 @@ class Links(Sequence[Link]):
         self._pending = list(links)  # added, but not yet converted to rows
 
     @classmethod
-    def from_sequence(cls, links: Sequence[Link]) -> Links:
+    def from_sequence(cls, links: Sequence[Link]) -> "Links":
         return links if isinstance(links, cls) else cls(links)
 
     def add(self, links: Iterable[Link]) -> None:
         self._pending += links
 
-    def select(self, mask: NDArray[np.bool_]) -> Links:
+    def select(self, mask: NDArray[np.bool_]) -> "Links":
         """Returns the links where the mask (n,) is true; this object itself if it is true for all."""
         if mask.all():
             return self

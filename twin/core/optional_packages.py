@@ -1,7 +1,5 @@
 """Import of packages that belong to an optional extra of this project."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Grid and tiles of an orthomosaic, which is made, written and evaluated tile by tile so that memory is bounded."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

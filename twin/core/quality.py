@@ -1,15 +1,12 @@
 """Records on the quality of a survey: consistency of the estimates, findings, and durations of actions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
 
 
 class EpipolarError(NamedTuple):

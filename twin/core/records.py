@@ -1,7 +1,5 @@
 """Records that are exchanged between packages: calibration, frames, readings, estimates, maps, and the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -81,7 +79,7 @@ class StereoRig:
     def left_from_right(self) -> Array:
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
-    def binned(self, by: int) -> StereoRig:
+    def binned(self, by: int) -> "StereoRig":
         """Returns the calibration of images in which whole blocks of `by` x `by` pixels are averaged to one pixel."""
         if by == 1:
             return self
@@ -92,7 +90,7 @@ class StereoRig:
         size = {"width_px": self.width_px // by, "height_px": self.height_px // by}
         return replace(self, **size, **focals, principal_point_px=None if has_default else centre)
 
-    def with_square_pixels(self) -> StereoRig:
+    def with_square_pixels(self) -> "StereoRig":
         """Returns the calibration of images that are resampled along their columns so that fy equals fx."""
         scale = self.fx_px / self.fy_px
         if scale == 1:
@@ -195,7 +193,7 @@ class Readings:
     #: (3,) unit vector that points vertically upwards, in body axes: an attitude without heading, as an IMU gives it.
     up: Array | None = None
     #: (time [s], readings) of earlier times, which arrived after the previous frame: pressure, AHRS, USBL.
-    late: tuple[tuple[float, Readings], ...] = ()
+    late: tuple[tuple[float, "Readings"], ...] = ()
 
 
 class Displacement(NamedTuple):
@@ -270,7 +268,7 @@ class Trajectory:
         path.write_text(header + line * len(rows) % tuple(rows.ravel().tolist()))
 
     @staticmethod
-    def load(path: Path) -> Trajectory:
+    def load(path: Path) -> "Trajectory":
         rows = np.loadtxt(path, ndmin=2)
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, :3] = geometry.rotation_from_wxyz(rows[:, [7, 4, 5, 6]])

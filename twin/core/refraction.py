@@ -7,8 +7,6 @@ projection is. A point at the depth Z is therefore seen at tan(w) = (X / Z) / (1
 a depth Z0 show it at 1 + s (1 / Z0 - 1 / Z) times its pinhole position.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

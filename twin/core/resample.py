@@ -4,8 +4,6 @@ OpenCV's warps round positions to 1/32 px. A prefilter (Unser et al. 1993, doi 1
 through the pixels, so that resampling adds no blur of its own: a port without refraction changes no image.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

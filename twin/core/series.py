@@ -1,7 +1,5 @@
 """Rows in order of time: an array that grows along its first axis, and the row nearest to a time."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,7 @@ class GrowingArray:
         self._buffer, self._n = np.empty((_INITIAL_CAPACITY, *shape), dtype), 0
 
     @classmethod
-    def wrap(cls, rows: NDArray[Any]) -> GrowingArray:
+    def wrap(cls, rows: NDArray[Any]) -> "GrowingArray":
         """Returns a growing array that holds the rows (n, *shape) without a copy."""
         wrapped = cls.__new__(cls)
         wrapped._buffer, wrapped._n = rows, len(rows)

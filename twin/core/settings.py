@@ -1,7 +1,5 @@
 """Settings of the estimators, and the braking of a vehicle without vision, which the mission and they agree on."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, fields
 from typing import Any

@@ -1,7 +1,5 @@
 """Threads: row bands, pairs of images, the next item, one for linear algebra. Results do not depend on the bands."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable, Iterator

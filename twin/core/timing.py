@@ -1,7 +1,5 @@
 """Stopwatch for the processing stages of a survey."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import defaultdict

@@ -4,8 +4,6 @@ The compiler does not vectorize across the bands of a colour; these intrinsics e
 for 4 x 4 pixels of an image, for 2 x 2 texels of a texture, and for entries of a table of R, G, B and a zero.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from llvmlite import ir
 from numba import types

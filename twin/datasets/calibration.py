@@ -1,7 +1,5 @@
 """Calibration of a stereo rig: camera models and the relative pose of the cameras, checked."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -101,7 +99,7 @@ class StereoCalibration:
     def sides(self) -> tuple[tuple[str, RecordedCamera], tuple[str, RecordedCamera]]:
         return ("left", self.left), ("right", self.right)
 
-    def with_baseline(self, baseline_m: float | None) -> StereoCalibration:
+    def with_baseline(self, baseline_m: float | None) -> "StereoCalibration":
         """Returns the calibration with this baseline or, for None, with its own if that is in metres beyond doubt.
 
         Raises TwinError for an impossible one, and for one of its own without a stated unit beyond `_BELIEVED_M`.
@@ -117,7 +115,7 @@ class StereoCalibration:
         pose[:3, 3] *= length_m / self.baseline_m
         return replace(self, right_from_left=pose)
 
-    def for_images(self, width_px: int, height_px: int) -> StereoCalibration:
+    def for_images(self, width_px: int, height_px: int) -> "StereoCalibration":
         """Returns the calibration with the size of the images set; raises TwinError if it does not fit this size."""
         size = width_px, height_px
         for name, camera in self.sides:

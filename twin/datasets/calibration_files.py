@@ -3,8 +3,6 @@
 An unknown key is refused: a dropped one (a distortion under another name) leaves a wrong calibration that looks right.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

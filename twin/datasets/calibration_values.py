@@ -1,7 +1,5 @@
 """Values of a calibration file: numbers, matrices, image sizes; keys that nobody read."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any

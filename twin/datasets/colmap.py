@@ -3,8 +3,6 @@
 In COLMAP, the corner of the first pixel is at (0, 0), so pixel coordinates are larger by 0.5 than in OpenCV.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

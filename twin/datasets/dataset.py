@@ -1,7 +1,5 @@
 """Recorded data set as readers return it (images, calibration, truth), and the interface of readers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

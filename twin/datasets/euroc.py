@@ -3,8 +3,6 @@
 In the files, times are in nanoseconds and true poses those of the body; in a `Dataset`, seconds and the left camera.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Copies of recorded images into exported data sets."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple

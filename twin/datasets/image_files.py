@@ -1,7 +1,5 @@
 """Reading of image files (PNG, JPEG, TIFF; 8 or 16 bits; grey, colour or Bayer) as 8-bit RGB."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Sequence

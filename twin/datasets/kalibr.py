@@ -1,7 +1,5 @@
 """Calibration files of Kalibr (cam0 is the left camera): camchain, single cameras of EuRoC folders, imu.yaml."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """KITTI odometry folders (Geiger et al. 2012), read and written: rectified images, calib.txt, times.txt, true poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stereo calibration of MATLAB's Computer Vision Toolbox: jsonencode(toStruct(stereoParams))."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Stereo rigs of Agisoft Metashape: the file of Export Cameras (XML) with a master and a slave sensor."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree.ElementTree import Element
 

@@ -3,8 +3,6 @@
 1 is the left camera, 2 the right one; R and T are the pose of the left camera in the axes of the right one.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

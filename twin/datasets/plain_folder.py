@@ -1,7 +1,5 @@
 """Reader of a plain folder: left/ and right/ with images of equal names, and a calibration file."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The readers of data sets: those of this package, and those that other packages register."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Recorded readings of navigation sensors (pressure, attitude, DVL, IMU): their checks, and the vertical by an IMU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -125,11 +123,7 @@ def in_body(inertial: SensorSeries, body_from_sensor: Array, errors: ImuErrorMod
 
 
 def vertical_series(
-    source: str,
-    inertial: SensorSeries,
-    body_from_sensor: Array,
-    errors: ImuErrorModel,
-    notes: list[str],
+    source: str, inertial: SensorSeries, body_from_sensor: Array, errors: ImuErrorModel, notes: list[str]
 ) -> SensorSeries | None:
     """Returns the direction of the vertical in body axes (unit vectors that point upwards) and its standard deviation.
 

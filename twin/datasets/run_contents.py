@@ -4,8 +4,6 @@ A writer is a function `export(contents, folder)` that writes to an existing fol
 the folders with many files. It raises TwinError for an image that is no undamaged PNG, and OSError.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

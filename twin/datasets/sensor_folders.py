@@ -4,8 +4,6 @@
 value) or, for the IMU, its noise in the terms of Kalibr.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Reading of text files of an untrusted data set: bounded size, YAML without code, paths inside the folder."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re

@@ -1,7 +1,5 @@
 """Files of the truth that a user names: poses as EuRoC/ASL (body), KITTI (camera 0) or TUM (left camera), heights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """TUM RGB-D layout: trajectories, read and written, and lists of images with times, written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from twin.core.records import Trajectory

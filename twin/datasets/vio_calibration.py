@@ -1,7 +1,5 @@
 """Calibration files of ORB-SLAM3, OKVIS, VINS-Fusion (CamOdoCal) and Basalt; the first camera is the left one."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

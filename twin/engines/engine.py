@@ -1,7 +1,5 @@
 """Engines that run many tasks in parallel: their interface, and the engine of this machine."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait

@@ -4,8 +4,6 @@ A survey runs compiled code, which can crash its process or hang without a way t
 in a worker process that can be killed and replaced.
 """
 
-from __future__ import annotations
-
 import math
 import multiprocessing
 import os

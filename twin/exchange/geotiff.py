@@ -5,11 +5,9 @@ they are in its coordinate reference system (CRS), with elevations above its ver
 origin, from which `scene_placement` computes scene coordinates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import rasterio
@@ -123,7 +121,7 @@ class OrthomosaicFile:
         self._file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         self._file.update_tags(**placement_tags(georeference))
 
-    def __enter__(self) -> OrthomosaicFile:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -1,7 +1,5 @@
 """The elevation map as a triangle mesh, with the colours of its cells as GLB (binary glTF)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ As in GTSAM, the information of a rotation refers to the rotation vector [1/rad^
 vector part of the quaternion (half the rotation vector, if small), so its values are four times as large.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A map in tiles: GeoTIFF files of its parts, and virtual rasters (GDAL VRT) that show them as one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

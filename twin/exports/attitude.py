@@ -1,7 +1,5 @@
 """Yaw, pitch and roll of a camera as photogrammetry and marine imaging define them: zero for one that looks down."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.records import Array

@@ -1,7 +1,5 @@
 """True calibration of the images of a scenario, as camera models of OpenCV."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Cells and pixels have the same scene coordinates as in the files of a run (`geotiff`), so all layers coincide exactly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

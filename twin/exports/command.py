@@ -1,7 +1,5 @@
 """The command `twin export`: reads a run from its folder and writes it in the formats of other programs."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

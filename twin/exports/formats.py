@@ -1,7 +1,5 @@
 """Formats of `twin export`: the table of all formats, and the checks of a request."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Sequence
 from importlib import import_module

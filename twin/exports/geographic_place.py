@@ -1,7 +1,5 @@
 """Place of a scene on the Earth: longitude and latitude of its points, and true north in its axes."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Writer of iFDO files (image FAIR Digital Object, version 2.1): metadata of an image set of marine imaging."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import uuid

@@ -1,7 +1,5 @@
 """Writer of reference files of Agisoft Metashape: position and attitude of each image as CSV."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from twin.core.georeference import Georeference

@@ -1,7 +1,5 @@
 """Writer of nerfstudio data sets: transforms.json with OpenGL camera axes, and the images."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files of a planned path for other programs: QGroundControl, KML, GPX and CSV."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Planned path of the vehicle as waypoints on the Earth: the plan of a scenario, for autopilots and maps."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 Points are the centres of the mapped cells, in the CRS of the georeference or, without one, in scene coordinates [m].
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

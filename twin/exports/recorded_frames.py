@@ -1,7 +1,5 @@
 """Frames and readings of the IMU that a run folder keeps, for exports."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

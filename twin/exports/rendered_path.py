@@ -1,7 +1,5 @@
 """Images and truth along a given path of the left camera, without a vehicle, as the folder of a run."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

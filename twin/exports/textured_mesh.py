@@ -5,8 +5,6 @@ a CRS. In GLB, x is east, y up and z south; in OBJ, x is east, y north and z up.
 GLB scene and the comments of the OBJ file state the position of the scene origin in the CRS.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """True layers of recorded frames: the images of the world are rendered again at the true poses of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple

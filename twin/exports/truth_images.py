@@ -1,7 +1,5 @@
 """Exact truth of recorded images as image files: depth, flow, normals, albedo, light, labels."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

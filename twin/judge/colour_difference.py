@@ -1,7 +1,5 @@
 """Colour difference CIEDE2000 of linear RGB colours (Sharma, Wu & Dalal 2005, doi 10.1002/col.20070)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Consistency of the estimated covariances: NEES, and fraction of errors within two sigma."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

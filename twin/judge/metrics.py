@@ -1,7 +1,5 @@
 """Contents of metrics.json: all metrics of a survey, with the same keys for complete and aborted surveys."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

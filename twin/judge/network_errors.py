@@ -1,7 +1,5 @@
 """Errors of the network: measured motions between keyframes, and keyframes after each positioning stage."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -3,8 +3,6 @@
 The displacement of patches is that of the peak of their normalised cross-correlation.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

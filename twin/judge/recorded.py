@@ -1,7 +1,5 @@
 """Comparison of a replay with its recorded truth: path (association by time, alignment, misfit) and map."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np

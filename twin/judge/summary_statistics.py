@@ -1,7 +1,5 @@
 """Summary statistics for metrics.json: finite numbers, or None if there are no values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import Any
 

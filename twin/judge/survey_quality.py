@@ -1,7 +1,5 @@
 """Quality of a survey as its estimators measure it, without the truth: image quality and self checks."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ The overlap of two keyframes is the fraction of the floor in the first image tha
 casting. Forecasts (from planned poses) and metrics (from true poses) use the same functions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Errors of the tasks of a survey: of their maps, and of the position before and after them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

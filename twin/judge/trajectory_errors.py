@@ -1,7 +1,5 @@
 """Absolute trajectory errors of estimates that are anchored at the first true pose, without a fitted transform."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,11 +1,10 @@
 """Verdict on the metrics of a survey: requirements of its scenario, and warnings of values that are out of bounds."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from twin.core.nested import leaves
 from twin.errors import TwinError
 
 #: Prefixes of metrics whose limit is a lower bound. The limit of every other metric is an upper bound.
@@ -52,15 +51,10 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
             raise TwinError(f"require.{name}", f"no such metric{hint}", "a dotted name of metrics.json")
 
 
-def numbers_of(metrics: Mapping[str, Any], prefix: str = "") -> dict[str, float | None]:
+def numbers_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
     """Returns each number and None in nested tables of `metrics` by its dotted path, but not those at its top level."""
-    found: dict[str, float | None] = {}
-    for key, value in metrics.items():
-        if isinstance(value, Mapping):
-            found |= numbers_of(value, f"{prefix}{key}.")
-        elif prefix and (value is None or isinstance(value, int | float)):
-            found[prefix + key] = value
-    return found
+    numbers = {name: value for name, value in leaves(metrics) if value is None or isinstance(value, int | float)}
+    return {name: value for name, value in numbers.items() if "." in name}
 
 
 def more_is_better(name: str) -> bool:

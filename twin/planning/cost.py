@@ -8,8 +8,6 @@ machine. The coefficients of the surrogate are fitted to `horseshoe` with 50 and
 loaded machine). Times on other machines can differ by a factor of two.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from twin.world.mission import Mission

@@ -1,23 +1,18 @@
 """Drawing of a survey plan: the path over the sea floor, and the overlap of the images."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource, ListedColormap
-from matplotlib.figure import Figure
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.height_field import cast_pixels
 from twin.planning.summary import OVERLAP_TOLERANCE, PlanSummary, required_overlaps
-from twin.report.plotting import add_coordinates
-from twin.report.style import COLOURS, FIGURE_STYLE, LABELS
+from twin.report.plotting import add_coordinates, png_figure
+from twin.report.style import COLOURS, LABELS
 from twin.world.mission import Mission
 from twin.world.planning import floor_of
 
@@ -26,11 +21,10 @@ _EDGE_POINTS = 40  #: along each side of the outline of an image
 _LEAST_DRAWN_M = 0.005  #: height above the floor at which the outlines of the objects are drawn
 
 
-def draw(summary: PlanSummary, file: Path) -> Path:
-    """Writes a PNG file that shows path and overlap of the plan over the floor from above, and returns its path."""
+def draw(summary: PlanSummary, file: Path) -> None:
+    """Writes a PNG file that shows path and overlap of the plan over the floor from above."""
     mission = summary.mission
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(14, 6.5))
+    with png_figure(file, 14, 6.5) as figure:
         plan, overlap = figure.subplots(1, 2, sharex=True, sharey=True)
         _draw_floor(plan, summary)
         _draw_holes(plan, mission)
@@ -42,9 +36,6 @@ def draw(summary: PlanSummary, file: Path) -> Path:
         for axes in (plan, overlap):
             axes.set_aspect("equal")
         figure.legend(loc="outside lower center", ncols=5)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        FigureCanvasAgg(figure).print_png(str(file))
-    return file
 
 
 def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:

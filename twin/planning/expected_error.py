@@ -1,7 +1,5 @@
 """Expected height error of the map, from the surrogate's error model at the floor points visible in the keyframes."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,25 +1,18 @@
 """Drawing of a vehicle's limits: speed by thrust, power by speed, and the current that it holds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from twin.planning.vehicle_limits import VehicleLimits, axes_of, electrical_power_w
-from twin.report.style import FIGURE_STYLE
+from twin.report.plotting import png_figure
 from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 
 
-def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
-    """Writes a PNG file and returns its path."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(14, 4.5))
+def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> None:
+    with png_figure(file, 14, 4.5) as figure:
         speed, power = (figure.add_subplot(1, 3, k) for k in (1, 2))
         for name, axis in axes_of(vehicle).items():
             speeds = np.linspace(0, limits.speeds_mps[name], 60)
@@ -33,9 +26,6 @@ def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
         speed.legend()
         if not vehicle.is_steered_by_fins:
             _draw_currents(figure.add_subplot(1, 3, 3, projection="polar"), vehicle)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        FigureCanvasAgg(figure).print_png(str(file))
-    return file
 
 
 def _draw_currents(axes: Any, vehicle: VehicleConfig) -> None:

@@ -1,7 +1,5 @@
 """Limits of a vehicle and what a survey asks of it: trim, speeds, forces, stopping distance, energy and dives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any

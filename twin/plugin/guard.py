@@ -1,7 +1,5 @@
 """Checked calls of plug-ins: an exception or an unusable value ends the survey with a reason that names the plug-in."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn

@@ -1,7 +1,5 @@
 """Loading of plug-ins: classes of other packages, named `module:Class` or registered as entry points."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable
 from functools import partial

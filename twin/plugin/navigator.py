@@ -1,7 +1,5 @@
 """Estimator of another package in a survey (`estimate.plugin`) or a replay: map and metrics follow from its poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Self
 

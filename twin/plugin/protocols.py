@@ -1,7 +1,5 @@
 """Interfaces of plug-ins: arguments and results of a controller, an estimator and a terrain of another package."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, Protocol
 
 from twin.controllers.allocation import ThrustAllocation

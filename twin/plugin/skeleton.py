@@ -1,7 +1,5 @@
 """Skeleton of a package with a plug-in, written by `twin new-plugin`: pyproject.toml, README.md, module and test."""
 
-from __future__ import annotations
-
 import importlib.util
 import keyword
 import re

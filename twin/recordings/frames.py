@@ -1,7 +1,5 @@
 """Frames of a data set for the estimators: images read, rectified and checked; unusable images are counted."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A data set that is ready to be replayed: its calibration, truth, readings and first stereo pair, all checked."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path

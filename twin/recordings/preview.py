@@ -1,7 +1,5 @@
 """Preview of a data set: one sheet of its first stereo pair: matches, disparity, light before and after."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Recorded readings as aiding of a replay: those of each frame, their noise, and a start that fits them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import islice

@@ -1,7 +1,5 @@
 """Rectification of recorded stereo pairs: removes lens distortion and rotates both cameras to parallel axes."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal, NamedTuple
 

@@ -1,7 +1,5 @@
 """Replay of a recorded stereo data set: runs the estimators on the frames, builds the map, compares with the truth."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

@@ -1,13 +1,11 @@
 """Recorded frames of a run: images written during the flight, with times, sensor readings and true poses."""
 
-from __future__ import annotations
-
 import csv
 from collections import deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal, Self, TextIO
 
 import cv2
 import numpy as np
@@ -72,7 +70,7 @@ class FrameRecorder:
         self._writer = ThreadPoolExecutor(1)
         self._tables = {name: reopened(self._folder / name, length) for name, length in state["_tables"].items()}
 
-    def __enter__(self) -> FrameRecorder:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

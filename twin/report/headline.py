@@ -1,7 +1,5 @@
 """Top of a report: badge with the verdict, sentences on the limitations, headline and key figures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 

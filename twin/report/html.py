@@ -1,7 +1,5 @@
 """Renders pages and texts from Jinja templates; all pages share a style sheet, number formats and a list of terms."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from importlib.resources import files
@@ -9,23 +7,14 @@ from typing import Any
 
 import jinja2
 
-from twin.report.number_formats import (
-    angle,
-    area_le90,
-    length,
-    milliradians,
-    milliseconds,
-    percent,
-    plain,
-    ratio,
-    with_unit,
-)
+from twin.report import number_formats
 
 _SHARED_TEMPLATES = "twin.report"
 #: Number formats by the names that they have in templates.
 _FILTERS = {
-    "length": length, "percent": percent, "plain": plain, "ms": milliseconds, "angle": angle,
-    "milliradians": milliradians, "ratio": ratio, "area_le90": area_le90,
+    "length": number_formats.length, "percent": number_formats.percent, "plain": number_formats.plain,
+    "ms": number_formats.milliseconds, "angle": number_formats.angle, "ratio": number_formats.ratio,
+    "milliradians": number_formats.milliradians, "area_le90": number_formats.area_le90,
 }  # fmt: skip
 
 
@@ -47,7 +36,7 @@ def _rendered(package: str, template: str, context: Mapping[str, Any], **options
         loader=jinja2.FunctionLoader(lambda name: _source(package, name) or _source(_SHARED_TEMPLATES, name)),
     )
     environment.filters |= {name: _of_defined(number) for name, number in _FILTERS.items()}
-    environment.filters["with_unit"] = with_unit
+    environment.filters["with_unit"] = number_formats.with_unit
     return environment.get_template(template).render(**context)
 
 

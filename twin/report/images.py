@@ -1,7 +1,5 @@
 """Reads image files and encodes images as downscaled JPEG data."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Input statement of a floor (`input` of metrics.json) as a table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Numbers with units as texts in reports."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,9 +1,9 @@
 """What the figures of all reports share: files, axes, legends, hill shading."""
 
-from __future__ import annotations
-
 import base64
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from twin.core.georeference import Georeference
+from twin.core.records import MapGrid
 from twin.report.images import png_bytes
 from twin.report.style import FIGURE_STYLE
 
@@ -27,6 +28,16 @@ def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> 
     with matplotlib.rc_context(FIGURE_STYLE):
         figures = {name: draw(*data) for name, draw in functions.items()}
         return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
+
+
+@contextmanager
+def png_figure(file: Path, width_in: float, height_in: float, grid: bool = True) -> Iterator[Figure]:
+    """Opens an empty figure in the style of the reports, and writes it to a PNG file at the end."""
+    with matplotlib.rc_context({**FIGURE_STYLE, "axes.grid": grid}):
+        figure = Figure(figsize=(width_in, height_in))
+        yield figure
+        file.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(file, format="png")
 
 
 def to_data_uri(figure: Figure) -> str:
@@ -49,6 +60,11 @@ def one_panel(height_in: float) -> tuple[Figure, Axes]:
 
 def legend_beside(axes: Axes) -> None:
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
+
+
+def extent_of(grid: MapGrid) -> tuple[float, float, float, float]:
+    """Returns west, east, south and north of a grid [m], for pictures of it."""
+    return grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m
 
 
 def add_coordinates(axes: Axes, origin: Georeference | None) -> None:

@@ -1,7 +1,5 @@
 """Rerun recording of a survey (run.rrd) and live viewer. No other module imports rerun."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

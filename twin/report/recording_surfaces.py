@@ -1,7 +1,5 @@
 """Elevation maps as coloured surfaces for the 3-D view, split into parts by the time of their first observation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

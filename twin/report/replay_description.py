@@ -1,7 +1,5 @@
 """Description of a replayed run in its run folder (scenario.resolved.toml): data set, settings and rectified rig."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple
@@ -23,11 +21,7 @@ class RunDescription(NamedTuple):
 
 
 def describe_replay(
-    name: str,
-    source: Mapping[str, Any],
-    rig: StereoRig,
-    settings: EstimatorSettings,
-    estimator: str | None = None,
+    name: str, source: Mapping[str, Any], rig: StereoRig, settings: EstimatorSettings, estimator: str | None = None
 ) -> RunDescription:
     """Returns the description of a replayed run: `source` (texts and numbers), rectified rig, and estimators."""
     tree = {

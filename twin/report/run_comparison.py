@@ -3,16 +3,15 @@
 Each figure function returns None if no run has the data that its figure shows.
 """
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from twin.core.nested import leaves
 from twin.core.user_files import resolved
 from twin.errors import TwinError
 from twin.judge.verdict import numbers_of
@@ -121,7 +120,7 @@ def table(runs: Sequence[Run]) -> list[Row]:
 
 def scenario_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
     """Returns the keys of the scenario in which the runs differ, with the value in every run as JSON, or a dash."""
-    flat = [dict(_flattened(run.scenario)) for run in runs]
+    flat = [dict(leaves(run.scenario)) for run in runs]
     keys = sorted(set().union(*flat))
     texts = {key: [_json(one[key]) if key in one else DASH for one in flat] for key in keys}
     return {key: values for key, values in texts.items() if len(set(values)) > 1}
@@ -265,15 +264,6 @@ def _compared(quantity: ComparedQuantity, value: float | None, first: float | No
 def _relative(factor: float) -> str:
     """Returns the ratio of two values as text: as a change in percent, e.g. "+10 %", below 3, otherwise as a factor."""
     return f"{100 * (factor - 1):+.0f} %" if factor < 3 else ratio(factor)
-
-
-def _flattened(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the dotted keys and the values of nested tables; a list is one value."""
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flattened(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _json(value: Any) -> str:

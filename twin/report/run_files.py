@@ -1,7 +1,5 @@
 """Validates the scenario and the JSON files of a run folder, which may have been edited since `twin run` wrote them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -62,10 +60,6 @@ def checked_index(index: Any) -> dict[str, Any]:
     if "map_from_world" in index and [len(row) for row in index["map_from_world"]] != [4] * 4:
         raise ValueError("map_from_world: must have 4 rows of 4 numbers")
     return index
-
-
-def checked_environment(environment: Any) -> dict[str, Any]:
-    return conform(environment, {})
 
 
 def checked_scenario(scenario: Any) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Reads a run folder. Only the scenario file is required; a folder without metrics.json is an unfinished survey."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +15,7 @@ from twin.errors import TwinError
 from twin.exchange.geotiff import Raster, read_georeference, read_mosaic, read_raster
 from twin.judge.recorded import ALIGNMENTS, AlignmentName, recorded_errors
 from twin.judge.trajectory_errors import PathErrors, path_errors
-from twin.report.run_files import (
-    OBSERVATION_KEYS,
-    checked_environment,
-    checked_index,
-    checked_metrics,
-    checked_scenario,
-)
+from twin.report.run_files import OBSERVATION_KEYS, checked_index, checked_metrics, checked_scenario, conform
 from twin.scenario.toml_text import parse_toml
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
@@ -96,7 +88,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
     return Run(
         folder,
         _read(folder / SCENARIO_FILE, lambda f: checked_scenario(parse_toml(read_text(f)))),
-        _read_json(folder / "env.json", checked_environment) or {},
+        _read_json(folder / "env.json", lambda given: conform(given, {})) or {},
         metrics or _read_json(folder / "metrics.json", checked_metrics),
         _read_existing({k: folder / f"trajectory_{k}.tum" for k in TRAJECTORIES}, Trajectory.load),
         _read_existing({k: folder / f"{k}.tif" for k in RASTERS}, read_raster)

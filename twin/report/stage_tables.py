@@ -5,8 +5,6 @@ frame period, all work on a keyframe within the N frame periods up to the next k
 vehicle keeps station.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Colours, labels and matplotlib settings shared by all figures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 #: Colour of each plotted quantity, by key. Those of the estimates are from the palette of Okabe & Ito, distinguishable

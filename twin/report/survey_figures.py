@@ -1,7 +1,5 @@
 """Figures of the survey report. Each figure function returns None if its data are missing from the run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +14,7 @@ from twin.report.plotting import (
     WIDTH_IN,
     add_coordinates,
     drawn,
+    extent_of,
     height_scale,
     hillshade,
     legend_beside,
@@ -54,7 +53,7 @@ def plan_view(run: Run) -> Figure | None:
     _map_axes(axes, run)
     if "dem_truth" in run.rasters:
         floor = run.rasters["dem_truth"]
-        axes.imshow(hillshade(subsampled(floor), "gray"), extent=_extent(floor), alpha=0.35)
+        axes.imshow(hillshade(subsampled(floor), "gray"), extent=extent_of(floor.grid), alpha=0.35)
     for name in ("reference", "truth", *ESTIMATES):
         if name in run.trajectories:
             x, y, _ = run.trajectories[name].positions.T
@@ -175,7 +174,7 @@ def elevation_maps(run: Run) -> Figure | None:
     figure = Figure(figsize=(WIDTH_IN, 4.0))
     panels = figure.subplots(1, len(rasters), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (raster, title) in zip(panels, rasters, strict=True):
-        _map_axes(axes, run).imshow(hillshade(subsampled(raster), "viridis", scale), extent=_extent(raster))
+        _map_axes(axes, run).imshow(hillshade(subsampled(raster), "viridis", scale), extent=extent_of(raster.grid))
         axes.set_title(title)
     figure.colorbar(ScalarMappable(Normalize(*scale), "viridis"), ax=panels, label="height [m]", shrink=0.8)
     return figure
@@ -208,7 +207,7 @@ def task_maps(run: Run) -> Figure | None:
         title = titles[number - 1] if number <= len(titles) else name
         heights, error = run.rasters[name], run.rasters.get(name.replace("/dem", "/dem_error"))
         scale = height_scale(heights.values.ravel())
-        _map_axes(row[0], run).imshow(hillshade(subsampled(heights), "viridis", scale), extent=_extent(heights))
+        _map_axes(row[0], run).imshow(hillshade(subsampled(heights), "viridis", scale), extent=extent_of(heights.grid))
         row[0].set_title(title)
         figure.colorbar(ScalarMappable(Normalize(*scale), "viridis"), ax=row[0], label="height [m]", shrink=0.8)
         if error is not None and np.isfinite(error.values).any():
@@ -219,7 +218,7 @@ def task_maps(run: Run) -> Figure | None:
 
 def _scalar_map(axes: Axes, raster: Raster, title: str, cmap: str, norm: Normalize) -> None:
     """Draws a raster with one band and its colour bar; cells without data are light grey."""
-    image = axes.imshow(subsampled(raster), cmap=cmap, norm=norm, extent=_extent(raster))
+    image = axes.imshow(subsampled(raster), cmap=cmap, norm=norm, extent=extent_of(raster.grid))
     axes.set_title(title)
     axes.set_facecolor("#dfe6ea")
     figure = axes.get_figure()
@@ -283,12 +282,6 @@ def subsampled(raster: Raster) -> np.ndarray:
     """Returns every n-th row and column of a raster, with the smallest n for which no side exceeds `MAP_CELLS`."""
     step = int(np.ceil(max(raster.values.shape[:2]) / MAP_CELLS))
     return raster.values[::step, ::step]
-
-
-def _extent(raster: Raster) -> tuple[float, float, float, float]:
-    """Returns the edges of a raster [m] in the order of matplotlib's `extent`: west, east, south, north."""
-    grid = raster.grid
-    return (grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m)
 
 
 def _map_axes(axes: Axes, run: Run) -> Axes:

@@ -1,7 +1,5 @@
 """report.html: a self-contained page about a survey, created from its run folder alone."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Mapping

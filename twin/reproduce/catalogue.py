@@ -1,7 +1,5 @@
 """All experiments of `twin reproduce`: each one writes its results to a folder and returns them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import partial

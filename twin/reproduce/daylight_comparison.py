@@ -5,44 +5,22 @@ default share of the sky. The upwelling light is compared over a black floor and
 reference use the same absorption, scattering and phase function.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.imaging.light.daylight import DaylightVeil, floor_daylight
 from twin.imaging.light.illumination import Daylight, Illumination, daylight_at
 from twin.imaging.light.optics import Optics
 from twin.imaging.light.sun_sky import sky_radiance
 from twin.imaging.light.water import Medium, medium
-from twin.imaging.reference.pixel_light import (
-    Effort,
-    PixelRay,
-    ReferenceScene,
-    Sunlight,
-    pixel_light,
-    plane_light,
-    refined,
-)
-from twin.reproduce.light_cell import (
-    ALBEDO,
-    GREEN,
-    MOST_WALKS,
-    ROUND,
-    Compared,
-    LightCell,
-    looking_down,
-    text_of,
-    within,
-)  # fmt: skip
+from twin.imaging.reference.pixel_light import PixelRay, ReferenceScene, Sunlight, pixel_light, plane_light
+from twin.reproduce.light_cell import ALBEDO, GREEN, WALKS, Compared, LightCell, estimate, looking_down, text_of, within
 from twin.scenario.model import SEA_WATER_INDEX, SunConfig, WaterConfig
-
-Array = NDArray[np.float64]
 
 WATERS, DEPTHS_M, RANGES_M, ELEVATIONS_DEG = ("IB", "II", "III", "1C", "3C"), (2.0, 5.0, 15.0), (1.0, 3.0), (90.0, 45.0)
 LIFT_M = 1e-3  # height of the slopes above the floor
@@ -59,7 +37,7 @@ ALL_DAYLIGHT: Selection = (WATERS, ELEVATIONS_DEG, DEPTHS_M, RANGES_M)
 QUICK_DAYLIGHT: Selection = (("IB", "III"), ELEVATIONS_DEG, (5.0,), (2.0,))
 
 
-def daylight_cells(selection: Selection = ALL_DAYLIGHT, walks: int = MOST_WALKS) -> Iterable[LightCell]:
+def daylight_cells(selection: Selection = ALL_DAYLIGHT, walks: int = WALKS) -> Iterable[LightCell]:
     """Yields the cells of a selection; `walks` is the largest number of Monte Carlo walks for each value."""
     for water, elevation_deg, depth_m, range_m in product(*selection):
         conditions = {"water": water, "elevation_deg": elevation_deg, "depth_m": depth_m, "range_m": range_m}
@@ -78,21 +56,22 @@ def _compared(water_type: str, elevation_deg: float, depth_m: float, range_m: fl
     daylight = daylight_at(sun, water, range_m)
     veil = DaylightVeil(daylight, np.array([0.0, range_m])).radiance(np.array([0.0, 0.0, -1.0]), depth_m)
     scene, found = reference_scene(daylight, water, depth_m + range_m), dict[str, Compared]()
-    effort = Effort(min(walks, ROUND))
     s, c = np.sin(np.deg2rad(SLOPE_DEG)), np.cos(np.deg2rad(SLOPE_DEG))  # the sun is in the east
     planes = {"level": ((0.0, 0.0, 1.0), range_m), "to_sun": ((s, 0.0, c), LIFT_M), "from_sun": ((-s, 0.0, c), LIFT_M)}
     for name, (normal, height_m) in planes.items():
         place = np.array([0.0, 0.0, height_m]), np.array(normal)
-        truth = refined(
+        truth = estimate(
             lambda one, place=place: plane_light(scene, *place, one),
-            lambda light: within(PLANE_ERROR, light.total), effort, walks,
-        )  # fmt: skip
+            lambda light: within(PLANE_ERROR, light.total),
+            walks,
+        )
         found[name] = Compared(plane_lx(daylight, place[1], depth_m + range_m - height_m), truth.total, "_lx")
     above_floor, ray = replace(scene, albedo=ALBEDO / 255), PixelRay(looking_down(range_m), RIG, (RIG.cx_px, RIG.cy_px))
-    truth = refined(
+    truth = estimate(
         lambda one: pixel_light(above_floor, ray, one),
-        lambda light: within(LIGHT_ERROR, light.total, light.veil), effort, walks,
-    )  # fmt: skip
+        lambda light: within(LIGHT_ERROR, light.total, light.veil),
+        walks,
+    )
     return found | {
         "veil": Compared(float(veil[1, GREEN]), truth.veil, "_cd_m2"),
         "lu": Compared(_model_lu(daylight, water, range_m), truth.total, "_cd_m2"),

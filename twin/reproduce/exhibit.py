@@ -1,22 +1,13 @@
 """Results of one experiment as tables and figures, and the files that hold the results of experiments."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure as Canvas
-
-from twin.core.records import MapGrid
 from twin.core.user_files import read_json
 from twin.errors import TwinError
 from twin.report.html import render_page
-from twin.report.style import FIGURE_STYLE
 
 SCHEMA = "twin.exhibit/1"
 RESULTS_FILE, PAGE_FILE = "results.json", "index.html"
@@ -55,20 +46,6 @@ class Exhibit(NamedTuple):
 
 def make_table(key: str, title: str, rows: Sequence[Sequence[str]]) -> Table:
     return Table(key, title, tuple(tuple(row) for row in rows))
-
-
-@contextmanager
-def drawn(file: Path, width_in: float, height_in: float) -> Generator[Canvas]:
-    """Opens an empty figure in the style of the reports, and writes it to a PNG file at the end."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Canvas(figsize=(width_in, height_in))
-        yield figure
-        FigureCanvasAgg(figure).print_png(str(file))
-
-
-def extent_of(grid: MapGrid) -> tuple[float, float, float, float]:
-    """Returns west, east, south and north of a grid [m], for pictures of it."""
-    return grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m
 
 
 def write_json(file: Path, contents: Any) -> None:

@@ -5,8 +5,6 @@ that reaches the cameras is proportional to albedo times illuminance. The textur
 the scenario then yields the images of the unevenly lit tank.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 

@@ -4,8 +4,6 @@ Each cell of the comparison has one water type, camera height, lamp arrangement 
 albedo, in the green band. Model and reference use the same absorption, scattering, phase function and lamps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import product
 
@@ -25,19 +23,8 @@ from twin.imaging.reference.pixel_light import (
     ReferenceScene,
     lamps_in_world,
     pixel_light,
-    refined,
 )
-from twin.reproduce.light_cell import (
-    ALBEDO,
-    GREEN,
-    MOST_WALKS,
-    ROUND,
-    Compared,
-    LightCell,
-    looking_down,
-    text_of,
-    within,
-)  # fmt: skip
+from twin.reproduce.light_cell import ALBEDO, GREEN, WALKS, Compared, LightCell, estimate, looking_down, text_of, within
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 
@@ -69,7 +56,7 @@ ALL_LAMPS: Selection = (WATERS, tuple(LAMP_ARRANGEMENTS), HEIGHTS_M, PIXELS)
 QUICK_LAMPS: Selection = (("IB", "III"), ("leds",), (2.0,), PIXELS[:2])
 
 
-def lamp_cells(selection: Selection = ALL_LAMPS, walks: int = MOST_WALKS, phase: str = "sea") -> Iterable[LightCell]:
+def lamp_cells(selection: Selection = ALL_LAMPS, walks: int = WALKS, phase: str = "sea") -> Iterable[LightCell]:
     """Yields the cells of a selection: conditions, with the light of a pixel by the model and by the reference.
 
     A cell has at most `walks` pairs of random walks; `phase` is a value of `water.phase_function`.
@@ -93,8 +80,7 @@ def _compared(scenario: Scenario, height_m: float, pixel: tuple[int, int], walks
     blur_near and blur_far are shares of the blurred light whose point of the floor would, without scattering, be imaged
     within `NEAR_PX` of the pixel and beyond `FAR_PX`.
     """
-    effort = Effort(min(walks, ROUND))
-    truth = refined(lambda one: reference_light(scenario, height_m, pixel, one), _is_accurate, effort, walks)
+    truth = estimate(lambda one: reference_light(scenario, height_m, pixel, one), _is_accurate, walks)
     model = model_light(scenario, height_m, pixel)
     near, far = _blur_shares(truth)
     unit = "_cd_m2"

@@ -1,7 +1,5 @@
 """Comparison of the light model of the images with a Monte Carlo of any order of scattering, in the green band."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -12,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from twin.imaging.reference.pixel_light import BatchMean
-from twin.report.plotting import log_axis
+from twin.report.plotting import log_axis, png_figure
 from twin.reproduce.daylight_comparison import ALL_DAYLIGHT, QUICK_DAYLIGHT, daylight_cells, daylight_table
-from twin.reproduce.exhibit import Exhibit, Figure, Table, drawn, make_table, write_json
+from twin.reproduce.exhibit import Exhibit, Figure, Table, make_table, write_json
 from twin.reproduce.lamp_comparison import ALL_LAMPS, QUICK_LAMPS, lamp_cells, lamp_table
-from twin.reproduce.light_cell import ALBEDO, MOST_WALKS, LightCell, write_csv
+from twin.reproduce.light_cell import ALBEDO, WALKS, LightCell, write_csv
 from twin.reproduce.relief_comparison import ALL_RELIEFS, QUICK_RELIEFS, relief_cells, relief_table
 
 MARKERS = {"leds": "o", "spots": "^"}
@@ -48,7 +46,7 @@ class LightComparison(NamedTuple):
         return summary | {name: write_csv(found, folder / f"{name}.csv") for name, found in more.items()}
 
 
-def compare(quick: bool, walks: int = MOST_WALKS, phase: str = "sea") -> LightComparison:
+def compare(quick: bool, walks: int = WALKS, phase: str = "sea") -> LightComparison:
     """Returns the comparison; arguments as for `lamp_cells`."""
     lamps = list(lamp_cells(QUICK_LAMPS if quick else ALL_LAMPS, walks, phase))
     relief = list(relief_cells(QUICK_RELIEFS if quick else ALL_RELIEFS, walks))
@@ -65,7 +63,7 @@ def run(folder: Path, quick: bool = False) -> Exhibit:
 
 
 def draw(cells: Sequence[LightCell], file: Path) -> None:
-    with drawn(file, 12.0, 7.5) as figure:
+    with png_figure(file, 12.0, 7.5) as figure:
         grid = figure.subplots(2, 2)
         figure.suptitle(
             "Light model and Monte Carlo reference, green band; bars: two standard errors of the reference", fontsize=12

@@ -1,19 +1,17 @@
 """Light by the light model and by the Monte Carlo reference in one situation: the records of all comparisons."""
 
-from __future__ import annotations
-
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.imaging.reference.pixel_light import BatchMean
+from twin.imaging.reference.pixel_light import BatchMean, Effort, Light, refined
 
 GREEN, ALBEDO = 1, 128  # band that is compared, and albedo of the floor; 255 = white
-ROUND, MOST_WALKS = 8_000, 1_500_000  # walks (for a pixel: pairs) in a round; most walks for each value
+_ROUND, WALKS = 8_000, 1_500_000  # walks (for a pixel: pairs) in a round; most walks for each value
 
 
 class Compared(NamedTuple):
@@ -37,7 +35,7 @@ class Compared(NamedTuple):
             return BatchMean(np.nan, np.nan)
         return BatchMean(self.truth.value / self.model, self.truth.standard_error / self.model)
 
-    def over(self, other: Compared) -> Compared:
+    def over(self, other: "Compared") -> "Compared":
         """Returns the quotient of two quantities, whose truths are independent."""
         value = self.truth.value / other.truth.value
         own, others = (one.truth.standard_error / one.truth.value for one in (self, other))
@@ -69,6 +67,11 @@ def write_csv(cells: Sequence[LightCell], file: Path) -> list[dict[str, Any]]:
         writer.writeheader()
         writer.writerows(rows)
     return rows
+
+
+def estimate(light_of: Callable[[Effort], Light], is_accurate: Callable[[Light], bool], walks: int) -> Light:
+    """Returns the light by the reference, which takes rounds until it is accurate; `walks` is their largest number."""
+    return refined(light_of, is_accurate, Effort(min(walks, _ROUND)), walks)
 
 
 def within(error: float, *means: BatchMean) -> bool:

@@ -1,7 +1,5 @@
 """The chapter "How true is it?" of docs/paper.md, generated from the results of `twin reproduce all`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The mission is flown three times: over the paper's coarse texture with alignment
 F2F motion alone, and at full resolution with alignment. All flights are by vision alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple

@@ -4,17 +4,15 @@ Motion between frames has to be computed within a frame period, and all work on 
 periods up to the next one.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.report.plotting import log_axis
+from twin.report.plotting import log_axis, png_figure
 from twin.report.stage_tables import KEYFRAME_STAGES
 from twin.report.style import COLOURS
-from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, drawn, make_table, percent, write_exhibit
+from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, percent, write_exhibit
 from twin.reproduce.paper_flight import fly_aligned
 from twin.scenario.file import load_scenario
 
@@ -112,7 +110,7 @@ def draw(stages: Mapping[str, Any], n_keyframes: int, file: Path) -> None:
     f2f = (stages.get("f2f") or {}).get("mean_ms") or 0.0
     values = [f2f, *(per_unit_ms(stages, name, n_keyframes) or 0.0 for name in KEYFRAME_STAGES)]
     labels = {module.stage: module.label for module in MODULES}
-    with drawn(file, 9.6, 2.8) as figure:
+    with png_figure(file, 9.6, 2.8) as figure:
         axes = figure.add_subplot()
         axes.barh([labels[name] for name in names][::-1], values[::-1], 0.6, color=COLOURS["online"])
         for k, name in enumerate(names[::-1]):

@@ -1,7 +1,5 @@
 """Flights of the paper's mission: with alignment, and on the integrated frame-to-frame motion alone."""
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Counterparts of Figs. 4 to 7 of Negahdaripour & Madjidi (2003)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,9 +9,8 @@ from numpy.typing import NDArray
 
 from twin.judge.map_error import height_error
 from twin.judge.trajectory_errors import keyframe_errors_m, path_errors
-from twin.report.plotting import hillshade, log_axis
+from twin.report.plotting import extent_of, hillshade, log_axis, png_figure
 from twin.report.style import COLOURS
-from twin.reproduce.exhibit import drawn, extent_of
 from twin.reproduce.paper_flight import Flown
 
 SHADES = ("#d55e00", "#0072b2")  # coarse texture, full resolution
@@ -22,7 +19,7 @@ MAP_CELLS = 700  # longest side of a drawn map
 
 def draw_paths(flights: Mapping[str, Flown], file: Path) -> None:
     """Draws the true, the F2F and the aligned path of each flight (Fig. 4)."""
-    with drawn(file, 12.0, 6.4) as figure:
+    with png_figure(file, 12.0, 6.4) as figure:
         panels = figure.subplots(1, len(flights), squeeze=False)[0]
         for axes, (name, flown) in zip(panels, flights.items(), strict=True):
             truth, f2f, final = flown.truth.trajectory, flown.result.f2f, flown.result.final
@@ -36,7 +33,7 @@ def draw_paths(flights: Mapping[str, Flown], file: Path) -> None:
 
 def draw_tracks(flights: Mapping[str, Flown], tracks: Sequence[int], file: Path) -> None:
     """Draws the errors of all keyframes up to the end of each track, before and after its alignment (Fig. 5)."""
-    with drawn(file, 12.0, 8.0) as figure:
+    with png_figure(file, 12.0, 8.0) as figure:
         panels = figure.subplots(3, -(-len(tracks) // 3), squeeze=False).ravel()
         for axes, track in zip(panels, tracks, strict=False):
             for (name, flown), colour in zip(flights.items(), SHADES, strict=False):
@@ -61,7 +58,7 @@ def _keyframe_errors(axes: Axes, flown: Flown, track: int, name: str, colour: st
 
 def draw_errors(flights: Mapping[str, Flown], file: Path) -> None:
     """Draws position, height and heading error along the path, with the ends of the tracks (Fig. 6)."""
-    with drawn(file, 12.0, 7.0) as figure:
+    with png_figure(file, 12.0, 7.0) as figure:
         position, height, heading = figure.subplots(3, 1, sharex=True)
         for (name, flown), colour in zip(flights.items(), SHADES, strict=False):
             errors = path_errors(flown.result.final, flown.truth.trajectory)
@@ -83,7 +80,7 @@ def draw_errors(flights: Mapping[str, Flown], file: Path) -> None:
 
 def draw_maps(coarse: Flown, unaligned: Flown, fine: Flown, file: Path) -> None:
     """Draws the true floor, the maps of the three flights and the histograms of their errors (Fig. 7)."""
-    with drawn(file, 13.0, 8.6) as figure:
+    with png_figure(file, 13.0, 8.6) as figure:
         panels = figure.subplots(2, 3)
         heights = coarse.truth.height_m
         scale = float(np.nanmin(heights)), float(np.nanmax(heights))

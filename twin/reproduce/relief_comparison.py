@@ -4,8 +4,6 @@ One lamp shines from port of a camera that points straight down, 2 m above the l
 one relief with a point of it: in a shadow, beside an edge of depth, or lit. Model and reference use the same heights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from itertools import product
@@ -19,20 +17,10 @@ from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.lamp_halos import LampHalos
 from twin.imaging.light.optics import Optics, SceneView
 from twin.imaging.light.shadows import Shadows
-from twin.imaging.reference.pixel_light import Effort, PixelLight, refined
+from twin.imaging.reference.pixel_light import PixelLight
 from twin.imaging.scene.facets import Facets
 from twin.reproduce.lamp_comparison import reference_light
-from twin.reproduce.light_cell import (
-    ALBEDO,
-    GREEN,
-    MOST_WALKS,
-    ROUND,
-    Compared,
-    LightCell,
-    looking_down,
-    text_of,
-    within,
-)  # fmt: skip
+from twin.reproduce.light_cell import ALBEDO, GREEN, WALKS, Compared, LightCell, estimate, looking_down, text_of, within
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 
@@ -77,7 +65,7 @@ ALL_RELIEFS: Selection = (WATERS, tuple(RELIEFS))
 QUICK_RELIEFS: Selection = (("II",), ("box, shadow", "cliff, far side"))
 
 
-def relief_cells(selection: Selection = ALL_RELIEFS, walks: int = MOST_WALKS) -> Iterable[LightCell]:
+def relief_cells(selection: Selection = ALL_RELIEFS, walks: int = WALKS) -> Iterable[LightCell]:
     """Yields the cells of a selection; `walks` is the largest number of pairs of Monte Carlo walks for each."""
     for water, name in product(*selection):
         scenario = load_scenario("reef", [f"water.jerlov={water}", "sun.illuminance_lx=0", *LAMP])
@@ -100,8 +88,8 @@ def pixel_of(scenario: Scenario, name: str) -> tuple[int, int]:
 
 def _compared(scenario: Scenario, name: str, walks: int) -> dict[str, Compared]:
     """Returns the light of a pixel by the model and by the reference; the keys are those of `lamp_comparison`."""
-    pixel, field, effort = pixel_of(scenario, name), field_of(name), Effort(min(walks, ROUND))
-    truth = refined(lambda one: reference_light(scenario, HEIGHT_M, pixel, one, field), _is_accurate, effort, walks)
+    pixel, field = pixel_of(scenario, name), field_of(name)
+    truth = estimate(lambda one: reference_light(scenario, HEIGHT_M, pixel, one, field), _is_accurate, walks)
     model, unit = model_light(scenario, pixel, field), "_cd_m2"
     return {
         "total": Compared(model["total"], truth.total, unit),

@@ -1,7 +1,5 @@
 """Tank experiments of Negahdaripour & Madjidi (2003, section V-B): closure, sizes of objects, and predicted errors."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,20 +13,9 @@ from numpy.typing import NDArray
 from twin.judge.map_error import height_error
 from twin.judge.summary_statistics import percentile
 from twin.judge.trajectory_errors import path_errors
+from twin.report.plotting import extent_of, png_figure
 from twin.report.style import COLOURS
-from twin.reproduce.exhibit import (
-    DASH,
-    Exhibit,
-    Figure,
-    Row,
-    Table,
-    drawn,
-    extent_of,
-    make_table,
-    millimetres,
-    percent,
-    write_exhibit,
-)
+from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
 from twin.reproduce.experiment_floors import OBJECTS
 from twin.reproduce.tank_sizes import SizeRow, hidden_cells, measure
 from twin.reproduce.tank_survey import QUICK, TankSurvey, closures, height_errors, survey_tank
@@ -158,7 +145,7 @@ LEAST_M, LARGEST_M = 2e-4, 0.1  # limits of the logarithmic scale of sigma and e
 
 
 def draw(title: str, survey: TankSurvey, file: Path) -> None:
-    with drawn(file, 13.0, 7.4) as figure:
+    with png_figure(file, 13.0, 7.4) as figure:
         figure.suptitle(title, fontsize=12)
         panels = figure.subplots(2, 3)
         _network(panels[0, 0], survey)

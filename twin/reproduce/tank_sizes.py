@@ -3,8 +3,6 @@
 Floor that the objects hide from the cameras is found by ray casting in the estimated map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 

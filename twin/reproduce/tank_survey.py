@@ -1,17 +1,15 @@
 """Surveys of the tank: the images that a rig on an overhead track takes, which is not straight, and the estimates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.segments import Reference
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
 from twin.core.records import ElevationMap, MapGrid, SurveyResult, Truth
 from twin.core.timing import Stopwatch
@@ -24,8 +22,6 @@ from twin.session.assembly import image_vision
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.world.mission import FrameSequence, Mission, Step, prepare
 from twin.world.rendered_world import RenderedWorld
-
-Array = NDArray[np.float64]
 
 AREA_M = (2.0, 1.5)  # mapped area around the centre of the tank
 QUICK = ("rig.image_width_px=320", "rig.image_height_px=240", "estimate.patch_px=15", "map.cell_m=0.003")

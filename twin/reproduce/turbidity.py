@@ -1,7 +1,5 @@
 """One object at five turbidities (Fig. 8 of Negahdaripour & Madjidi 2003), and contrast as a function of range."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,21 +8,19 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from twin.app.look import image_quality, render_view
+from twin.core.geometry import Array
 from twin.core.records import Image, StereoRig
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
 from twin.imaging.light.water import Medium
-from twin.report.plotting import log_axis
-from twin.reproduce.exhibit import Exhibit, Figure, drawn, make_table, write_json
+from twin.report.plotting import log_axis, png_figure
+from twin.reproduce.exhibit import Exhibit, Figure, make_table, write_json
 from twin.reproduce.experiment_floors import block_on_sand
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 from twin.world.mission import prepare
-
-Array = NDArray[np.float64]
 
 JERLOV = "II"
 TURBIDITIES = (0.0, 0.5, 1.5, 3.0, 6.0)  # values of `water.turbidity`
@@ -151,7 +147,7 @@ def write(levels: Sequence[TurbidityLevel], folder: Path) -> dict[str, Any]:
 def draw(levels: Sequence[TurbidityLevel], file: Path) -> None:
     height, width = levels[0].image.shape[:2]
     image_in = PANEL_IN * height / width
-    with drawn(file, PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6) as figure:
+    with png_figure(file, PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6) as figure:
         grid = figure.add_gridspec(3, len(levels), height_ratios=[image_in, 1.6, 3.4])
         figure.suptitle(_title(levels), fontsize=12)
         top = max(_histogram_of(level.image, band).max() for level in levels for band in range(3))

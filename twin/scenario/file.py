@@ -1,7 +1,5 @@
 """Reading, validation and writing of scenarios as TOML files, with base files and overrides."""
 
-from __future__ import annotations
-
 import copy
 import os
 import re

@@ -1,7 +1,5 @@
 """Idealisations of a scenario: effects of a real survey that it leaves out, so that simulated errors are too small."""
 
-from __future__ import annotations
-
 from twin.scenario.model import CalibrationErrorConfig, Scenario
 
 

@@ -1,7 +1,5 @@
 """Rigs, vehicles, sets of navigation sensors as files: published or own numbers, and their sources."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Line numbers of the keys in a TOML text."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections import Counter

@@ -1,7 +1,5 @@
 """Parsing of TOML text within limits of size, nesting and numbers, so that no file exhausts memory, stack or time."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator

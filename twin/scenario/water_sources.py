@@ -1,7 +1,5 @@
 """Names, citations and water types of the published tables of absorption and scattering in the package `jerlov`."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 WaterSourceName = Literal["solonenko2015", "williamson2022"]

@@ -4,20 +4,13 @@ The controller is designed with the parameters of the vehicle and ignores the dr
 scenario, which therefore act as model errors. The top speed includes the drag factor, the loads include both factors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 
 from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocation
 from twin.controllers.current_estimate import unknown_current
-from twin.controllers.tracking import (
-    ControllerState,
-    HullModel,
-    feedforward_wrench,
-    pole_placement_gains,
-)
+from twin.controllers.tracking import ControllerState, HullModel, feedforward_wrench, pole_placement_gains
 from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import trimmed_hull

@@ -5,8 +5,6 @@ position with the new velocity and the rotation with the new angular velocity. T
 `mujoco_vehicle.MujocoVehicle` within rounding errors.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -18,19 +16,13 @@ from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
 from twin.simulate.contact import OPEN_WATER, FloorField, contact_error, touches_floor
-from twin.simulate.fins import Fins, add_fins, fins_of, set_fin_commands, step_fins, velocity_through_water
+from twin.simulate.fins import Fins, add_fins, command_fins, fins_of, step_fins, velocity_through_water
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import Sea, flow_at
 from twin.simulate.tether import NO_TETHER, Tether, add_tether
-from twin.simulate.thrusters import (
-    ThrusterState,
-    lagged_thrusters,
-    set_thruster_command,
-    step_thrusters,
-    thruster_wrench,
-)  # fmt: skip
+from twin.simulate.thrusters import ThrusterState, command_thrusters, lagged_thrusters, step_thrusters, thruster_wrench
 
 AT_REST = np.zeros(3)
 
@@ -78,23 +70,11 @@ class CompiledVehicle:
             fins_of(vehicle, timestep_s), trimmed_hull(vehicle), sea, timestep_s, np.zeros(1, np.int64), floor, tether,
             np.full(1, -1),
         )  # fmt: skip
-        self._time_s = 0.0
+        self.sea, self.tether, self.thrusters, self._time_s = sea, tether, thrusters, 0.0
 
     @property
     def world_from_body(self) -> Array:
         return self.state.pose.copy()
-
-    @property
-    def tether(self) -> Tether:
-        return self.state.tether
-
-    @property
-    def sea(self) -> Sea:
-        return self.state.sea
-
-    @property
-    def thrusters(self) -> ThrusterState:
-        return self.state.thrusters
 
     @property
     def twist_body(self) -> Array:
@@ -137,8 +117,8 @@ def advance(body, command, n_steps):
     """Advances the state by `n_steps` timesteps under commands (n,); stops early if the hull touches the floor."""
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
     n_thrusters = len(thrusters.steady_n)
-    set_thruster_command(thrusters, command[:n_thrusters])
-    set_fin_commands(body.fins, command[n_thrusters:])
+    command_thrusters(thrusters, command[:n_thrusters])
+    command_fins(body.fins, command[n_thrusters:])
     for n in range(n_steps):
         now = velocity + 0.5 * body.timestep_s * acceleration
         flow = flow_at(body.sea, body.n_steps[0] * body.timestep_s, pose[:3, 3])

@@ -1,7 +1,5 @@
 """Contact of the vehicle's hull, a box, with the floor and with meshes; it ends a survey."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Table of a measured or modelled current: velocities over time and height, read from CSV or NetCDF."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Velocities of a current at one place, read from a NetCDF file of the CF convention."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Beams that the floor reflects: the altimeter, and the bottom lock of the Doppler velocity log (DVL)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

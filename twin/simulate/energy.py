@@ -1,7 +1,5 @@
 """Electrical energy of a survey, and the number of dives that it takes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Faults of thrusters, cameras, lamps, sensors and water: when each is active, and its effect on commands and data."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Design of the autopilot of a vehicle that is steered by fins: linear-quadratic regulator about its trim."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import solve_continuous_are
 

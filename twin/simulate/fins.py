@@ -7,8 +7,6 @@ that of a flat plate; its drag is lift times tan alpha, that of a foil without s
 Borst 1985, ch. 17: a fin of small aspect ratio), an upper limit. The drag at zero lift is part of that of the hull.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -52,7 +50,7 @@ def fins_of(vehicle: VehicleConfig, timestep_s: float) -> Fins:
 
 
 @kernel
-def set_fin_commands(fins, command):
+def command_fins(fins, command):
     """Sets the commands (m,) of the m movable fins, clipped to [-1, 1], for the following steps."""
     k = 0
     for n in range(len(fins.max_rad)):

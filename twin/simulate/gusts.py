@@ -3,8 +3,6 @@
 Single gusts, of faults, have a known start, end and velocity.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

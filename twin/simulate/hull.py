@@ -1,7 +1,5 @@
 """Hull of the vehicle of a scenario; timestep and speed limits of the physics."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -14,8 +14,6 @@ of buoyancy. The velocity of the water varies little over the hull. The equation
 inertia: added-mass forces from the acceleration of the previous step would be unstable where added mass exceeds mass.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What drifts between the cameras and the floor as a fault: a cloud of silt, and a school of fish."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

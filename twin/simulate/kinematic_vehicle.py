@@ -1,7 +1,5 @@
 """Vehicle without dynamics: it stays level at constant height and moves at the commanded horizontal velocity."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Vehicle simulated by MuJoCo under a force that produces the acceleration of the hydrodynamic model."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -15,14 +13,14 @@ from twin.scenario.model import VehicleConfig
 from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.compiled_vehicle import AT_REST
 from twin.simulate.contact import contact_error, nothing
-from twin.simulate.fins import add_fins, fins_of, set_fin_commands, step_fins, velocity_through_water
+from twin.simulate.fins import add_fins, command_fins, fins_of, step_fins, velocity_through_water
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import Sea, flow_at
 from twin.simulate.sensors import inertial_quantities
 from twin.simulate.tether import NO_TETHER, Tether, add_tether
-from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, step_thrusters, thruster_wrench
+from twin.simulate.thrusters import command_thrusters, lagged_thrusters, step_thrusters, thruster_wrench
 
 
 class MujocoVehicle:
@@ -120,8 +118,8 @@ class MujocoVehicle:
         """Simulates as `CompiledVehicle.step` does, with all obstacles."""
         n_steps = whole_timesteps(duration_s, self._model.opt.timestep)
         n_thrusters = len(self.thrusters.steady_n)
-        set_thruster_command(self.thrusters, command[:n_thrusters])
-        set_fin_commands(self._fins, command[n_thrusters:])
+        command_thrusters(self.thrusters, command[:n_thrusters])
+        command_fins(self._fins, command[n_thrusters:])
         for _ in range(n_steps):
             self._advance(thruster_wrench(self.thrusters))
             step_thrusters(self.thrusters)

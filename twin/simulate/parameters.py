@@ -1,7 +1,5 @@
 """Parameters of a vehicle as arrays, from the section [vehicle] of a scenario."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """When readings are taken, and when they arrive."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Motion of the water at any time and place: mean current, tide, gusts and waves."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,6 @@
 """Steady flight of a vehicle that is steered by fins: its trim on a level circle, minimum speed and turning radius."""
 
-from __future__ import annotations
-
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -83,15 +82,11 @@ def minimum_speed_mps(vehicle: VehicleConfig) -> float:
     """
     buoyancies_n = np.clip([vehicle.buoyancy_n - _RESERVE_N, vehicle.buoyancy_n + _RESERVE_N], -20, 20).tolist()
     loaded = [vehicle.model_copy(update={"buoyancy_n": buoyancy_n}) for buoyancy_n in buoyancies_n]
-    least = np.inf
-    for speed in _SPEEDS_MPS:
-        if not all(_is_easy(each, trim(each, speed)) for each in loaded):
-            break
-        least = round(float(speed), 2)
-    if least == np.inf:
+    speeds = list(takewhile(lambda speed: all(_is_easy(one, trim(one, speed)) for one in loaded), _SPEEDS_MPS))
+    if not speeds:
         problem = f"cannot keep the height against a net buoyancy of {vehicle.buoyancy_n:g} N"
         raise TwinError("vehicle.fins", problem, "larger fins, or a vehicle.buoyancy_n nearer to 0")
-    return least
+    return round(float(speeds[-1]), 2)
 
 
 def turning_radius_m(vehicle: VehicleConfig, speed_mps: float, share: float = _TRIM_SHARE) -> float:
@@ -99,15 +94,11 @@ def turning_radius_m(vehicle: VehicleConfig, speed_mps: float, share: float = _T
 
     Raises TwinError if they cannot turn the vehicle.
     """
-    least = np.inf
-    for curvature in _CURVATURES_PER_M:
-        if not _is_easy(vehicle, trim(vehicle, speed_mps, curvature), share):
-            break
-        least = float(1 / curvature)
-    if least == np.inf:
+    turns = list(takewhile(lambda k: _is_easy(vehicle, trim(vehicle, speed_mps, k), share), _CURVATURES_PER_M))
+    if not turns:
         problem = f"cannot turn the vehicle at {speed_mps:g} m/s within {1 / _CURVATURES_PER_M[0]:g} m"
         raise TwinError("vehicle.fins", problem, "larger fins, or another plan.speed_mps")
-    return least
+    return float(1 / turns[-1])
 
 
 def _is_easy(vehicle: VehicleConfig, found: Trim | None, share: float = _TRIM_SHARE) -> bool:

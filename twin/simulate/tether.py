@@ -1,7 +1,5 @@
 """Tether of a vehicle: its drag in the current, and its pull where it is caught."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

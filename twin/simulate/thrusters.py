@@ -1,7 +1,5 @@
 """Thruster model: steady thrust as a function of the command, and linear lag."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +56,7 @@ def lagged_thrusters(vehicle: VehicleParameters, timestep_s: float) -> ThrusterS
 
 
 @kernel
-def set_thruster_command(thrusters, command):
+def command_thrusters(thrusters, command):
     """Sets the commands (n,), clipped to [-1, 1], for the following steps."""
     clipped = np.minimum(np.maximum(command, -1.0), 1.0)
     steady_n = thrusters.factors * steady_thrust_n(clipped, thrusters.coefficients, thrusters.table)

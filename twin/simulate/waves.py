@@ -1,7 +1,5 @@
 """Orbital motion of surface waves by linear theory, as a sum of sines with a JONSWAP spectrum."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Each rendered survey is paired with the surrogate survey that has the same seed 
 other than `imaging.fidelity`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Statistical analysis of a study's results: pass probability, metrics, sensitivities and reasons for failure."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable
@@ -12,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from twin.core.records import Mask
 from twin.judge.map_error import with_completeness
 from twin.judge.verdict import more_is_better
 from twin.studies import statistics
@@ -32,7 +31,6 @@ from twin.studies.study_file import FIDELITY, Study
 
 _MAX_REASONS = 12
 _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them
-Mask = NDArray[np.bool_]
 
 
 class MetricSummary(NamedTuple):

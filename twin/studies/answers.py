@@ -1,7 +1,5 @@
 """Verdicts on ranges of a key: where the pass probability is shown to reach, or to miss, the required one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
@@ -10,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import xlogy
 
+from twin.core.records import Mask
 from twin.studies.monotone import FallingCurve, falling_curve
 from twin.studies.statistics import Array, Proportion, clustered_proportion, surveys_to_decide
 
 Verdict = Literal["passes", "fails", "undecided"]
-Mask = NDArray[np.bool_]
 _INFLUENCE_DEVIANCE = 10.0  # exceeded in 2 to 5 % of studies by a key without influence
 _TURNING_DEVIANCE = 15.0  # exceeded in less than 1 % of samples with one pass probability
 

@@ -1,7 +1,5 @@
 """Conditions of a study's surveys: its rig, what is idealised, and the sea trial (scenes/conditions/sea_trial.toml)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path

@@ -1,18 +1,15 @@
 """Probability distribution, or list of values, of one varied key of a study."""
 
-from __future__ import annotations
-
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtri
 
+from twin.core.geometry import Array
 from twin.scenario.model import Number, Section
 
-Array = NDArray[np.float64]
 Pair = tuple[Number, Number]
 Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 
@@ -43,7 +40,7 @@ class Distribution(Section):
         return given
 
     @model_validator(mode="after")
-    def _valid_parameters(self) -> Distribution:
+    def _valid_parameters(self) -> Self:
         if self.kind in _LAWS:
             rule, is_valid, _ = _LAWS[self.kind]
             if not is_valid(*self.values):
@@ -91,11 +88,7 @@ _LAWS: dict[str, tuple[Any, Any, Any]] = {
         lambda low, high: 0 < low < high,
         lambda p, low, high: np.exp(np.log(low) + np.log(high / low) * p),
     ),
-    "normal": (
-        "standard deviation > 0",
-        lambda _, sigma: sigma > 0,
-        lambda p, mean, sigma: mean + sigma * ndtri(p),
-    ),
+    "normal": ("standard deviation > 0", lambda _, sigma: sigma > 0, lambda p, mean, sigma: mean + sigma * ndtri(p)),
     "truncated_normal": (
         "standard deviation > 0, low < high",
         lambda _, sigma, low, high: sigma > 0 and low < high,

@@ -1,15 +1,14 @@
 """Flies one survey of a study, keeps the requested output files, and returns its row of results."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from twin.core.nested import leaves
 from twin.errors import ScenarioError, TwinError, UnmodelledError
 from twin.studies.surveys import Sample, Survey
 
@@ -103,16 +102,8 @@ def failure_reason(row: Row) -> str:
 
 def flatten(metrics: Mapping[str, Any]) -> Row:
     """Returns the values in sections of metrics.json by dotted name, e.g. "map.le90_m"; run times begin "timing."."""
-    row = dict(_leaves({name: section for name, section in metrics.items() if isinstance(section, Mapping)}, ""))
+    row = {name: value for name, value in leaves(metrics) if "." in name}
     for track in metrics.get("tracks", ()):
         for name, value in track.items():
             row[f"{'timing.' if name == 'ga_ms' else ''}tracks.{track['track']}.{name}"] = value
     return row
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value

@@ -7,8 +7,6 @@ of both log-likelihoods follows a law without unknown parameters (Banerjee & Wel
 pass and fail data: 2005, Scand. J. Stat. 32, 405), so that p(x) differs from p0 where it exceeds `CRITICAL`.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Map of the pass probability over two keys at once: isotonic regression along both, with an interval in each cell."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Progress of a study on stderr: a bar on a terminal, one line a minute elsewhere, and one per survey on request."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -1,7 +1,5 @@
 """Check of a surrogate study: the surveys whose metrics lie closest to the limits are repeated with rendered images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Results of a study for readers: the pages study.html and agreement.md, and the summary that `--json` prints."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from importlib.metadata import version

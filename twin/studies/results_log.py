@@ -1,7 +1,5 @@
 """Results of a study on disk: one JSON line per survey while it runs, and one Parquet table at the end."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

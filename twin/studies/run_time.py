@@ -1,7 +1,5 @@
 """Run time of rendered surveys, expected from those flown so far, and durations as text."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 

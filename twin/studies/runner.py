@@ -1,7 +1,5 @@
 """Runs a study: flies the surveys on many workers, logs one row per survey, and writes the table and the report."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import time

@@ -1,7 +1,5 @@
 """Text of the study report: metrics, confidence intervals, and the sentences that summarise the results."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

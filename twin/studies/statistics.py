@@ -1,7 +1,5 @@
 """Statistics of a sample of surveys: proportions, quantiles, correlations and Sobol indices, with 95 % intervals."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from bisect import bisect_left
@@ -14,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 from scipy.special import betaincinv, ndtri
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
+
 LEVEL = 0.95  #: confidence level of every interval
 RESAMPLES = 2000  #: number of resamples of every bootstrap
 _Z = float(ndtri(0.5 + LEVEL / 2))

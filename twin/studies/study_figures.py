@@ -1,7 +1,5 @@
 """Figures of the study report."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from itertools import chain

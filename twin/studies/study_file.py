@@ -1,7 +1,5 @@
 """Study file (TOML): the scenario, its fixed and varied keys, the sampling, the requirements, and the search."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

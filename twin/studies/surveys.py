@@ -1,7 +1,5 @@
 """Surveys of a study: design points, samples of the varied keys, and the validated scenario of each sample."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable, Iterator, Mapping
 from itertools import product
 from pathlib import Path
@@ -9,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from twin.core.geometry import Array
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import read_tree, with_values
 from twin.scenario.model import Scenario, Source
-from twin.studies.distribution import Array
 from twin.studies.study_file import SamplingMethod, Study, named_keys
 
 _DESIGN_STREAM = 0x57D1  # separates the random numbers of the design from those of a survey with the same seed

@@ -5,8 +5,6 @@ true poses. Reported covariances and errors of motions are expressed as standard
 vector [px], by the covariance that the surrogate reports for one of unit standard deviation.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from itertools import pairwise

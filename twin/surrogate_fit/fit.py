@@ -6,8 +6,6 @@ make the values robust against a few failed measurements. Each kind of value has
 the surveys do not determine keeps its value in the compared model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple

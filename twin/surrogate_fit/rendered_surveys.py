@@ -1,7 +1,5 @@
 """Flies rendered surveys, compares their image measurements with the surrogate's, and fits the error model."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -4,8 +4,6 @@ All candidates are flown with the same samples and seeds. Finalists, the plans t
 with new samples and seeds. The plans to be verified are then flown as rendered surveys, with further samples and seeds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

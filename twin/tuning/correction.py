@@ -1,7 +1,5 @@
 """Correction of a plan's surrogate results, estimated from plans with both rendered and surrogate surveys."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

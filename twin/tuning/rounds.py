@@ -1,7 +1,5 @@
 """Search for a survey plan with the surrogate; rendered surveys verify the cheapest plans before one is recommended."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Multi-objective search with Optuna's TPE sampler (tree-structured Parzen estimator); stores trials in a journal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Report of a search: tuning.html, pareto.png, and the plan: recommended.toml, or candidate.toml if it is not shown."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from importlib.metadata import version
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Verification of a plan: the results of its rendered surveys, what they show, and how many more are needed."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from twin.report.number_formats import percent

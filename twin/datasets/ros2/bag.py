@@ -4,8 +4,6 @@ A bag is untrusted. Messages are decoded with the message definitions of ROS 2 H
 which rosbags would generate code. Sizes are checked before memory is allocated for them.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Images in the messages of a ROS 2 bag, decoded when needed, and the choice of the topics of a stereo pair."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reader of ROS 2 bags: images of two topics, CameraInfo, sensor readings, and true poses of a topic that is named."""
 
-from __future__ import annotations
-
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Readings of navigation sensors in a ROS 2 bag: Imu, FluidPressure and TwistWithCovarianceStamped (DVL)."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Iterable
 from itertools import islice

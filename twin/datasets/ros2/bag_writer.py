@@ -1,7 +1,5 @@
 """Writer of ROS 2 bags in MCAP: images, calibration, transforms, odometry, readings of the navigation sensors."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator
 from operator import itemgetter

@@ -1,7 +1,5 @@
 """Calibration of a stereo rig from sensor_msgs/CameraInfo (REP 104), in messages or in files of ROS."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

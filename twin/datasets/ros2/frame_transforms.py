@@ -1,7 +1,5 @@
 """Poses in the messages of a ROS 2 bag, and the static transforms that join its coordinate frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@
 right and y down in the image, and z along the optical axis.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
