@@ -7,7 +7,8 @@ one line per survey to OUT.jsonl; surveys already in the file are not flown agai
 mission and the wrong ones:
 
 hostile: status "complete" although the largest position error of a frame exceeds 4 times its standard deviation (of
-    the worst keyframe and the motion since the last keyframe), or less than 90 % of the asked area is mapped;
+    the worst keyframe and the motion since the last keyframe), the RMS of error / sigma of the map exceeds 4, or less
+    than 90 % of the asked area is mapped;
 ordinary: status other than "complete".
 """
 
@@ -26,10 +27,11 @@ import twin
 from twin import survey
 from twin.errors import TwinError
 
-MAX_SIGMAS, MIN_COMPLETENESS, N_ORDINARY = 4.0, 0.9, 60
+MAX_SIGMAS, MAX_MAP_SIGMAS, MIN_COMPLETENESS, N_ORDINARY = 4.0, 4.0, 0.9, 60
 SHORT = ("plan.area_m=[2.0,1.0]", "plan.tracks=1")
-#: Faults that no image shows: scaling baseline, path and floor together leaves all images unchanged.
-UNOBSERVABLE = ("baseline error 5 %",)
+#: Faults that no image shows: scaling baseline, path and floor together leaves all images unchanged, and so does, over
+#: motions across the optical axis, scaling focal length and depths.
+UNOBSERVABLE = ("baseline error 5 %", "focal length error 2 %")
 FLOOR_FILE = ("terrain.kind=file", "terrain.height_file={folder}/floor.npy", "terrain.height_spacing_m=0.04")
 SUN = ("lamps=[]", "sun.illuminance_lx=20000", "sun.depth_m=5")
 
@@ -104,6 +106,7 @@ HOSTILE = {
     "snow 1500": ("snow.density_per_m3=1500",),
     "snow 5000": ("snow.density_per_m3=5000",),
     "focal length error 10 %": ("calibration_error.focal_error=0.1",),
+    "focal length error 2 %": ("calibration_error.focal_error=0.02",),
     "baseline error 5 %": ("calibration_error.baseline_error=0.05",),
     "yaw error 0.1 deg": ("calibration_error.right_yaw_deg=0.1",),
     "yaw error 2 deg": ("calibration_error.right_yaw_deg=2",),
@@ -112,6 +115,7 @@ HOSTILE = {
     "left principal point error 5 px": ("calibration_error.left_principal_point_error_px=[5,0]",),
     "right principal point error 2 px": ("calibration_error.right_principal_point_error_px=[2,0]",),
     "right principal point error 2 px down": ("calibration_error.right_principal_point_error_px=[0,2]",),
+    "k1 error 0.02": ("calibration_error.k1_error=0.02",),
     "k1 error 0.1": ("calibration_error.k1_error=0.1",),
     "flat port, not calibrated": ("port.kind=flat",),
     "current 0.5 m/s across": ("current.velocity_mps=[0,0.5,0]",),
@@ -180,7 +184,8 @@ def fly(name, overrides, seed):
         sigma_m = np.hypot(check.get("sigma_max_m") or 0.0, check.get("frame_sigma_m") or 0.0)  # between keyframes
         row |= {"error_m": final.get("ate_max_m"), "sigma_m": float(sigma_m)}
         row |= {"nees": (metrics.get("consistency") or {}).get("nees_position_mean")}
-        return row | {"completeness": (metrics.get("map") or {}).get("completeness_area")}
+        found = metrics.get("map") or {}
+        return row | {"completeness": found.get("completeness_area"), "map_sigma_ratio": found.get("sigma_ratio")}
 
 
 def is_wrong(row):
@@ -189,7 +194,8 @@ def is_wrong(row):
         return row["status"] != "complete"
     if row["status"] != "complete" or row["mission"] in UNOBSERVABLE:
         return False
-    return row["error_m"] > MAX_SIGMAS * row["sigma_m"] or row["completeness"] < MIN_COMPLETENESS
+    wrong_map = (row.get("map_sigma_ratio") or 0.0) > MAX_MAP_SIGMAS
+    return wrong_map or row["error_m"] > MAX_SIGMAS * row["sigma_m"] or row["completeness"] < MIN_COMPLETENESS
 
 
 def line(row):
@@ -198,8 +204,9 @@ def line(row):
     if row.get("error_m") is not None and row.get("sigma_m"):
         figures = f"error {1e3 * row['error_m']:.1f} mm, sigma {1e3 * row['sigma_m']:.1f} mm"
         figures += f", {row['completeness']:.0%} mapped" if row.get("completeness") is not None else ""
+        figures += f", map {row['map_sigma_ratio']:.1f} sigma" if row.get("map_sigma_ratio") is not None else ""
     mark = "WRONG" if is_wrong(row) else "ok"
-    return f"{mark:5} {row['mission']:36} {row['seed']:3} {row['status']:9} {figures:48} {row['reason'][:150]}"
+    return f"{mark:5} {row['mission']:36} {row['seed']:3} {row['status']:9} {figures:64} {row['reason'][:150]}"
 
 
 def main():

@@ -8,7 +8,7 @@ from judge_synthetic import survey
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from twin.core import geometry
-from twin.core.quality import CalibrationEstimate, DisparityOffset, EpipolarError, EstimationQuality
+from twin.core.quality import CalibrationEstimate, DisparityOffset, DistortionError, EpipolarError, EstimationQuality
 from twin.core.records import StereoObservation, StereoRig
 from twin.estimate.calibration_errors import disparity_offset, mean_views
 from twin.estimate.self_check import check_survey, with_length_error
@@ -177,6 +177,7 @@ def quality(**changes):
         ({}, {"n_points": 20}, "points"),
         ({"epipolar": PATTERN}, {}, "row_pattern"),
         ({"disparity_offset": DisparityOffset(-1e-3, 1e-4)}, {}, "disparity_offset"),
+        ({"distortion": DistortionError(0.03, 0.002)}, {}, "distortion"),
         ({}, {"row_offset_px": -0.3}, "row_offset"),
         ({}, {"repetition": 0.9}, "repetition"),
     ],
@@ -241,6 +242,30 @@ def test_an_error_of_all_lengths_is_part_of_the_covariances():
     known = np.isfinite(elevation.sigma_m)
     np.testing.assert_allclose((higher.sigma_m**2 - elevation.sigma_m**2)[known], (share * 2.0) ** 2, rtol=1e-4)
     assert with_length_error(result, elevation, [])[0] is result
+
+
+def test_a_distortion_is_a_finding_if_it_is_significant_and_larger_than_errors_of_matching():
+    """k1 changes disparities of 20.8 px at 2 m by 2 k1 times themselves: 0.6 px for k1 = 0.0144."""
+    for found, expected in (
+        ((0.02, 0.002), True),
+        ((0.02, 0.006), False),
+        ((-0.02, 0.002), True),
+        ((0.01, 1e-4), False),
+    ):
+        result = replace(survey_result(), quality=quality(distortion=DistortionError(*found)))
+        findings = check_survey(replace(result, stereo_observations=[OBSERVATION]), RIG)
+        assert [finding.check for finding in findings] == ["distortion"] * expected
+        assert not expected or findings[0].length_error == pytest.approx(0.04)
+
+
+def test_the_effect_of_a_row_pattern_on_positions_is_left_to_the_alignment():
+    result, elevation = survey_result(), survey()[1]
+    result = replace(result, quality=quality(epipolar=PATTERN), stereo_observations=[OBSERVATION])
+    (finding,) = check_survey(result, RIG, elevation)
+    inflated, higher = with_length_error(result, elevation, [finding])
+    np.testing.assert_array_equal(inflated.node_cov, result.node_cov)
+    known = np.isfinite(elevation.sigma_m)
+    assert np.all(higher.sigma_m[known] > elevation.sigma_m[known])
 
 
 def test_an_uncertain_position_is_a_finding():

@@ -26,6 +26,13 @@ class DisparityOffset(NamedTuple):
     sigma: float  #: standard deviation of `estimate`
 
 
+class DistortionError(NamedTuple):
+    """Radial distortion of both cameras that is not corrected, estimated from the motions between keyframes."""
+
+    estimate: float  #: k1, true minus believed
+    sigma: float  #: standard deviation of `estimate`
+
+
 class YawEffect(NamedTuple):
     """Yaw of the right camera away from the left one, estimated from a motion between keyframes, and its effect."""
 
@@ -78,6 +85,7 @@ class EstimationQuality(NamedTuple):
     frame_sigma_m: float | None = None
     #: offset common to all disparities, from the links; None without images or if it is not observable.
     disparity_offset: DisparityOffset | None = None
+    distortion: DistortionError | None = None  #: error of k1, from the links; None without images
     calibration: CalibrationEstimate = EXACT  #: errors of the calibration found by self-calibration
     #: number of independent errors equivalent to the position errors of all keyframes; None without a final alignment.
     independent_errors: float | None = None

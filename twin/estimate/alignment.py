@@ -13,7 +13,7 @@ import numpy as np
 
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import CalibrationEstimate, DisparityOffset
+from twin.core.quality import CalibrationEstimate
 from twin.core.records import Mask, SensorNoise, StereoRig
 from twin.estimate.adjustment.pose_graph import (
     BinaryFactors,
@@ -26,7 +26,7 @@ from twin.estimate.adjustment.pose_graph import (
     prior_factors,
 )
 from twin.estimate.navigation import aiding
-from twin.estimate.self_calibration import SharedParameters, shared_parameters
+from twin.estimate.self_calibration import NOTHING_MEASURED, MeasuredErrors, SharedParameters, shared_parameters
 from twin.estimate.vision.stereo import Keyframe
 
 _OUTLIER_CHI2 = 40.0  # chi-square with six degrees of freedom; one inlier in 2 million exceeds it
@@ -59,8 +59,7 @@ def align(
     rig: StereoRig,
     noise: SensorNoise,
     marginals_of: Sequence[int] | None = None,
-    offset: DisparityOffset | None = None,
-    row_pattern: float = 0.0,
+    measured: MeasuredErrors = NOTHING_MEASURED,
 ) -> AlignmentResult:
     """Returns the maximum-likelihood poses of a window of nodes, their covariances, and the links removed as outliers.
 
@@ -69,15 +68,14 @@ def align(
         anchors: prior covariance (6, 6) [rotation, translation] (rad, m) of each anchored node, by node number; the
             prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
-        offset: offset of all disparities, measured by the links; used if the calibration states that it may have one.
-        row_pattern: RMS of a systematic row difference between the cameras [focal lengths]; 0: none.
+        measured: errors of the calibration that are estimated together with the poses.
 
     Raises:
         LinAlgError: the links, anchors and sensor readings do not constrain every node.
     """
     links, dropped = Links.from_sequence(links), list[Link]()
     displacements = [kind for kind in [aiding.displacement_factors(nodes, rig)] if len(kind.i)]
-    shared = shared_parameters(rig, noise, bool(displacements), offset, row_pattern)
+    shared = shared_parameters(rig, noise, bool(displacements), measured)
     unary = [_anchor_factors(nodes, anchors), *aiding.unary_factors(nodes, rig, noise)]
     graph = FactorGraph(len(nodes), unary, [_motion_factors(nodes, links, shared), *displacements], shared.prior)
     start = GraphState(np.array([node.world_from_camera for node in nodes]), shared.prior.mean)

@@ -18,7 +18,14 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import CalibrationEstimate, DisparityOffset, EpipolarError, LengthScale, YawEffect
+from twin.core.quality import (
+    CalibrationEstimate,
+    DisparityOffset,
+    DistortionError,
+    EpipolarError,
+    LengthScale,
+    YawEffect,
+)
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.link_selection import RECURRENCE
 from twin.estimate.navigation.dvl import body_displacement
@@ -34,23 +41,31 @@ _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many
 def disparity_offset(
     offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int, n_views: float, focal_px: float
 ) -> DisparityOffset | None:
-    """Returns the weighted mean of the offsets of the links, with their standard deviations of independent links.
+    """Returns the weighted mean (`weighted_mean`) of the offsets of the links.
 
-    None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`). The variance is
-    multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes that share the
-    errors of relief, with c = `RECURRENCE` and m = `n_views` (`mean_views`), and by the mean chi-square if above 1.
+    None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`).
     """
-    if not offsets or n_nodes < 1:
+    if not offsets or n_nodes < 1 or np.median([offset.sigma for offset in offsets]) * focal_px > MAX_LINK_SIGMA_PX:
         return None
+    return DisparityOffset(*weighted_mean(offsets, n_nodes, n_views))
+
+
+def weighted_mean(
+    offsets: Sequence[DisparityOffset | DistortionError | YawEffect], n_nodes: int, n_views: float
+) -> tuple[float, float]:
+    """Returns the weighted mean of estimates by links, with their sigmas of independent links, and its sigma.
+
+    The variance is multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes
+    that share the errors of relief, with c = `RECURRENCE` and m = `n_views` (`mean_views`), and by the mean chi-square
+    if above 1.
+    """
     value, sigma = np.array([offset[:2] for offset in offsets]).T
-    if np.median(sigma) * focal_px > MAX_LINK_SIGMA_PX:
-        return None
     weight = sigma**-2
     mean = float(np.sum(weight * value) / np.sum(weight))
     chi2 = float(np.mean(weight * (value - mean) ** 2))
     shared_by = max(len(offsets) / n_nodes, 1.0) * (1 + RECURRENCE * (n_views - 1))
     variance = max(chi2, 1.0) * shared_by / float(np.sum(weight))
-    return DisparityOffset(mean, variance**0.5)
+    return mean, variance**0.5
 
 
 def row_pattern(

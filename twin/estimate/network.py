@@ -14,7 +14,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import CalibrationEstimate, DisparityOffset, YawEffect
+from twin.core.quality import CalibrationEstimate, DisparityOffset, DistortionError, YawEffect
 from twin.core.records import Alignment, Displacement, SensorNoise, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer
@@ -22,7 +22,7 @@ from twin.errors import SurveyAborted
 from twin.estimate import calibration_errors, link_selection
 from twin.estimate.alignment import AlignmentResult, align
 from twin.estimate.calibration_errors import row_pattern
-from twin.estimate.self_calibration import fused
+from twin.estimate.self_calibration import MeasuredErrors, fused
 from twin.estimate.vision.epipolar_calibration import NOTICEABLE_PX
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision_interface import Vision
@@ -40,9 +40,10 @@ class LinkAttempt(NamedTuple):
 
     link: Link | None  #: None if the measurement failed
     residual: float = np.nan  #: residual of the points divided by the expected one; NaN if the measurement failed
-    #: disparity_offset, yaw: see `Motion`; None if the points of the link do not determine it.
+    #: disparity_offset, yaw, distortion: see `Motion`; None if the points of the link do not determine it.
     disparity_offset: DisparityOffset | None = None
     yaw: YawEffect | None = None
+    distortion: DistortionError | None = None
 
 
 @dataclass
@@ -54,10 +55,11 @@ class AlignmentHistory:
     #: before_ga, after_ga: positions (n, 3) of the keyframes just before and after each alignment of a track [m].
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
-    #: link_residuals, disparity_offsets, yaws: those of all `LinkAttempt`s; offsets that are None are left out.
+    #: link_residuals, disparity_offsets, yaws, distortions: those of all `LinkAttempt`s, without None.
     link_residuals: list[float] = field(default_factory=list[float])
     disparity_offsets: list[DisparityOffset] = field(default_factory=list[DisparityOffset])
     yaws: list[YawEffect] = field(default_factory=list[YawEffect])
+    distortions: list[DistortionError] = field(default_factory=list[DistortionError])
     #: standard deviations (3-D) of positions relative to the previous keyframe, by F2F alone [m], where known.
     frame_sigmas_m: list[float] = field(default_factory=list[float])
     nodes_bridged: int = 0  #: number of nodes whose link to the previous node is the F2F motion
@@ -142,6 +144,7 @@ class KeyframeNetwork:
                 motion.residual,
                 motion.disparity_offset,
                 motion.yaw,
+                motion.distortion,
             )
             for (other, overlap), motion in zip(others, motions, strict=True)
         ]
@@ -197,6 +200,7 @@ class KeyframeNetwork:
             self.history.link_residuals += [attempt.residual for attempt in attempts]
             self.history.disparity_offsets += [a.disparity_offset for a in attempts if a.disparity_offset is not None]
             self.history.yaws += [attempt.yaw for attempt in attempts if attempt.yaw is not None]
+            self.history.distortions += [a.distortion for a in attempts if a.distortion is not None]
 
     def align_window(self, track: int) -> Array | None:
         """Aligns the nodes of the window of tracks that ends with `track`, and rebuilds the mosaic from this track.
@@ -268,10 +272,19 @@ class KeyframeNetwork:
         """
         if not offsets:
             return None
-        nodes = self.nodes if viewed is None else viewed
-        poses, depth_m = (np.array([getattr(n, key) for n in nodes]) for key in ("world_from_camera", "depth_m"))
-        n_views = calibration_errors.mean_views(poses, depth_m, self.rig)
+        n_views = self._mean_views(self.nodes if viewed is None else viewed)
         return calibration_errors.disparity_offset(offsets, n_nodes, n_views, self.rig.focal_px)
+
+    def distortion(self) -> DistortionError | None:
+        """Returns the mean error of k1 by all links; None without one."""
+        found, n_nodes = self.history.distortions, len(self.nodes) - 1
+        if not found or n_nodes < 1:
+            return None
+        return DistortionError(*calibration_errors.weighted_mean(found, n_nodes, self._mean_views(self.nodes)))
+
+    def _mean_views(self, nodes: Sequence[Keyframe]) -> float:
+        poses, depth_m = (np.array([getattr(n, key) for n in nodes]) for key in ("world_from_camera", "depth_m"))
+        return calibration_errors.mean_views(poses, depth_m, self.rig)
 
     def offset_by_motions(self) -> DisparityOffset | None:
         """Returns the offset of all disparities by the links; None where they are corrected for the yaw instead."""
@@ -301,9 +314,9 @@ class KeyframeNetwork:
         anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: self.reference_cov}
         start_s = time.perf_counter()
         yaw = self.disparity_offset(self.history.yaws, len(self.nodes) - 1) if self.rig.yaw_sigma_rad else None
-        pattern = self._row_pattern()
+        measured = MeasuredErrors(yaw, self._row_pattern())
         try:
-            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, yaw, pattern)
+            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, measured)
         except np.linalg.LinAlgError as error:
             self._alignable = False
             raise SurveyAborted(f"global alignment failed: {error}") from None

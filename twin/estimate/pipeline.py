@@ -420,6 +420,7 @@ class Navigator:
             epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
             disparity_offset=self.network.offset_by_motions(),
+            distortion=self.network.distortion(),
             calibration=history.calibration,
             independent_errors=history.independent_errors,
             length_scale=across,

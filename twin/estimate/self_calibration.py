@@ -27,6 +27,17 @@ from twin.estimate.vision.image_errors import coefficient_sigmas
 DVL, YAW, BASELINE = "dvl", "yaw", "baseline"
 
 
+class MeasuredErrors(NamedTuple):
+    """Errors of the calibration that links and row differences show."""
+
+    #: offset of all disparities by the links; used if the calibration states that it may have one.
+    offset: DisparityOffset | None = None
+    row_pattern: float = 0.0  #: RMS of a systematic row difference between the cameras [focal lengths]; 0: none
+
+
+NOTHING_MEASURED = MeasuredErrors()
+
+
 class SharedParameters(NamedTuple):
     """Shared parameters: named ones, and after them the coefficients of `image_errors` if there are any errors."""
 
@@ -67,20 +78,15 @@ class SharedParameters(NamedTuple):
         return CalibrationEstimate(float(value[0]), float(value[1]), cov)
 
 
-def shared_parameters(
-    rig: StereoRig, noise: SensorNoise, with_dvl: bool, offset: DisparityOffset | None, row_pattern: float
-) -> SharedParameters:
-    """Returns the parameters to estimate; `offset` is that of the links, None where it is not observable.
-
-    `row_pattern` is the RMS of a systematic row difference [focal lengths], 0 if there is none.
-    """
+def shared_parameters(rig: StereoRig, noise: SensorNoise, with_dvl: bool, measured: MeasuredErrors) -> SharedParameters:
+    """Returns the parameters to estimate."""
     rows = [(DVL, 0.0, noise.dvl_scale)] if with_dvl else []
     if rig.yaw_sigma_rad > 0:
-        rows.append((YAW, *fused(rig.yaw_sigma_rad, offset)))
+        rows.append((YAW, *fused(rig.yaw_sigma_rad, measured.offset)))
     if rig.baseline_sigma > 0:
         rows.append((BASELINE, 0.0, rig.baseline_sigma))
     names, mean, sigma = zip(*rows, strict=True) if rows else ((), (), ())
-    errors = coefficient_sigmas(row_pattern) if row_pattern else np.zeros(0)
+    errors = coefficient_sigmas(measured.row_pattern) if measured.row_pattern else np.zeros(0)
     prior = SharedPrior(np.append(np.array(mean, np.float64), 0 * errors), np.append(sigma, errors))
     return SharedParameters(names, prior, bool(len(errors)))
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.core.quality import EstimationQuality, Finding
+from twin.core.quality import DistortionError, EstimationQuality, Finding
 from twin.core.records import ElevationMap, StereoRig, SurveyResult
 from twin.estimate.calibration_errors import SIGNIFICANT, contradicts, row_pattern
 from twin.estimate.vision.image_quality import MAX_REPETITION
@@ -25,6 +25,7 @@ MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correcti
 MAX_ROW_PATTERN_PX = 0.1  # systematic row difference that pitch, yaw, roll and a row offset do not explain, RMS
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_DISPARITY_OFFSET_PX = 0.08  # offset of all disparities, estimated from the motions between keyframes
+MAX_DISTORTION_PX = 0.6  # disparity error by a radial distortion, and by the yaw that is estimated in its place
 MAX_SCALE_ERROR = 0.01  # relative difference of lengths from the images and from navigation sensors
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
@@ -182,6 +183,8 @@ def _consistency(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
             " calibrated"
         )
         yield from damage.check("disparity_offset", offset.estimate, MAX_DISPARITY_OFFSET_PX, text)
+    if quality.distortion is not None and len(result.keyframe_depth_m):
+        yield from _distortion(quality.distortion, damage)
     yield from _scale(quality)
     text = f"the motions between keyframes contradict each other (chi-square {chi2 or 0:.1f}, 1 expected)"
     yield from _above("link_chi2", chi2, MAX_LINK_CHI2, text)
@@ -197,6 +200,18 @@ def _consistency(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
         sigma_m = _largest_sigma_m(result, -np.inf)
         text = f"the standard deviation of a keyframe position reaches {sigma_m * 100:.1f} cm"
         yield from _above("sigma", sigma_m / depth_m, MAX_SIGMA_DEPTHS, text)
+
+
+def _distortion(k1: DistortionError, damage: _Damage) -> list[Finding]:
+    """Returns a finding if the motions show a radial distortion that changes disparities d by 2 k1 d, as a yaw does."""
+    if abs(k1.estimate) <= SIGNIFICANT * k1.sigma:
+        return []
+    disparity = damage.rig.baseline_m / float(np.median(damage.result.keyframe_depth_m))
+    text = (
+        f"the motions between keyframes imply that k1 is off by {k1.estimate:+.3f} +- {k1.sigma:.3f}: the distortion or"
+        " the port is not as calibrated"
+    )
+    return damage.check("distortion", 2 * k1.estimate * disparity, MAX_DISTORTION_PX, text)
 
 
 def _scale(quality: EstimationQuality) -> list[Finding]:

@@ -30,6 +30,17 @@ def image_errors(points: Array, half_size: Array) -> Array:
     return errors
 
 
+def change_by_distortion(points: Array) -> Array:
+    """Returns the change (n, 3) of normalised (x, y, disparity) of stereo points per k1 that is not corrected.
+
+    Both cameras have the radial distortion x (1 + k1 r^2) (Brown 1966).
+    """
+    x, y, disparity = points.T
+    left, right = (column * (column**2 + y**2) for column in (x, x - disparity))
+    rows = y * (x**2 + (x - disparity) ** 2 + 2 * y**2) / 2  # mean of both images
+    return np.column_stack([left, rows, left - right])
+
+
 def coefficient_sigmas(row_pattern: float) -> Array:
     """Returns the standard deviations (18,) of the coefficients, given the RMS of a systematic row difference.
 

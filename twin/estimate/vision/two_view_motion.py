@@ -12,8 +12,8 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.quality import DisparityOffset, YawEffect
-from twin.estimate.vision.image_errors import image_errors
+from twin.core.quality import DisparityOffset, DistortionError, YawEffect
+from twin.estimate.vision.image_errors import change_by_distortion, image_errors
 from twin.estimate.vision.observation_equations import (
     LinearisedObservations,
     PairMeasurements,
@@ -53,6 +53,7 @@ class Motion(NamedTuple):
     closed_form: Array | None = None  #: (4, 4) motion by eq. 2 from which the estimation started, if it did
     disparity_offset: DisparityOffset | None = None  #: offset of all disparities, if it is estimated (`pair_motion`)
     yaw: YawEffect | None = None  #: yaw between the cameras, as `disparity_offset`
+    distortion: DistortionError | None = None  #: error of k1, estimated together with the yaw
     #: (6, 18) correction of the motion by the coefficients of `image_errors` (rad, m), as `yaw.by_yaw`.
     by_image_errors: Array | None = None
 
@@ -164,6 +165,7 @@ def _adjust_pair(
     return motion._replace(
         disparity_offset=_disparity_offset(normals, settings),
         yaw=_yaw(normals, measured, settings),
+        distortion=_distortion(normals, measured, settings),
         by_image_errors=_by_image_errors(normals, measured, settings),
     )
 
@@ -235,6 +237,26 @@ def _yaw(normals: _WeightedNormals, measured: PairMeasurements, settings: PairMo
     moved = np.einsum("nij,nj->ni", normals.observations.jacobian_point, change_by_yaw(measured.b))
     found = _additional_unknown(normals, change_by_yaw(measured.a) - moved, settings)
     return None if found is None else YawEffect(*found)
+
+
+def _distortion(
+    normals: _WeightedNormals, measured: PairMeasurements, settings: PairMotionSettings
+) -> DistortionError | None:
+    """Returns the error of k1, estimated with the yaw, which changes points at one depth in nearly the same way."""
+    observations = normals.observations
+    a, b = (np.stack([change_by_distortion(z), change_by_yaw(z)], axis=2) for z in (measured.a, measured.b))
+    derivative = a - observations.jacobian_point @ b
+    weighted = normals.weight[:, None, None] * (observations.information @ derivative)
+    coupling = np.einsum("nrp,nrk->pk", observations.jacobian_motion, weighted)
+    by_unknowns = np.linalg.solve(normals.normal, coupling)
+    information = np.einsum("nrk,nrl->kl", derivative, weighted)
+    remaining = information - coupling.T @ by_unknowns  # after elimination of the motion
+    if np.any(np.linalg.eigvalsh(remaining) <= 0):
+        return None
+    cov = np.linalg.inv(remaining)
+    score = np.einsum("nrk,nr->k", weighted, observations.residual) - by_unknowns.T @ normals.right
+    variance = max(normals.scale, _MIN_SCALE) ** 2 * settings.variance_inflation * cov[0, 0]
+    return DistortionError(float(cov[0] @ score), float(variance**0.5))
 
 
 def _by_image_errors(
