@@ -1,1 +1,1 @@
-"""Vehicle parameters, the builder of the MuJoCo scene model, and the scenario files."""
+"""Vehicle parameters, the builder of the MuJoCo model of the vehicle, and the scenario files."""

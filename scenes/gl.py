@@ -26,5 +26,3 @@ class _MuJoCo:
 
 mujoco: Any = _MuJoCo()  #: Any: type checkers cannot read the compiled modules of MuJoCo
 MjModel: TypeAlias = Any
-MjSpec: TypeAlias = Any
-MjsBody: TypeAlias = Any

@@ -13,7 +13,7 @@ from twin.terrains.input_statement import InputStatement
 
 Index = NDArray[np.int64]
 
-#: Limits set by memory: the model for rendering takes about 400 bytes per node and 9 bytes per texel.
+#: Limits set by memory: a world with images takes about 70 bytes per node while it opens, and 4 bytes per texel.
 MAX_NODES = 6_000_000
 MAX_TEXELS = 250_000_000
 

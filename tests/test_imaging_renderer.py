@@ -10,6 +10,7 @@ from mujoco_floor import floor_model, image, ray_lengths
 
 from twin import terrains
 from twin.core import geometry
+from twin.imaging.scene.floor_raster import BLOCK_CELLS, floor_grid
 from twin.imaging.scene.renderer import Renderer
 from twin.imaging.scene.texture_levels import levels_of
 from twin.terrains import Terrain, TextureSource
@@ -81,6 +82,15 @@ def test_depth_agrees_with_rays_for_cells_of_any_size(spacing_m: float, steps_m:
     )
     error = errors_of_depth(rough(spacing_m, steps_m, n), pose, some_pixels(3000))
     assert (error < 1e-3).mean() >= 0.999
+
+
+def test_the_bounds_of_a_block_of_cells_are_those_of_its_nodes() -> None:
+    height, n = np.add.outer(np.arange(35), np.arange(50)).astype(np.float32), BLOCK_CELLS
+    _, low, high = floor_grid(height)
+    assert low.shape == (3, 4)
+    for i, j in np.ndindex(low.shape):
+        nodes = height[n * i : n * (i + 1) + 1, n * j : n * (j + 1) + 1]
+        assert (low[i, j], high[i, j]) == (nodes.min(), nodes.max())
 
 
 def test_triangles_that_reach_behind_the_camera_are_clipped_at_the_near_plane() -> None:

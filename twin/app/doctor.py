@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 _PACKAGES = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "rasterio", "rerun-sdk")
 _ENOUGH_DISK_GB = 2.0
+_DRAWING_LIMIT_S = 60.0
 INSTALL_LINE = "apt-get install -y libegl1 libgl1 libgl1-mesa-dri"
 
 
@@ -49,7 +50,7 @@ def check_opengl() -> Check:
     with tempfile.TemporaryDirectory() as folder:
         mesh = Path(folder) / "mesh.glb"
         trimesh.creation.icosphere(vertex_colors=(200, 200, 200)).export(mesh)
-        drawn = surface_picture(mesh) is not None
+        drawn = surface_picture(mesh, limit_s=_DRAWING_LIMIT_S) is not None
     found = (
         "draws the surface in reports" if drawn else "reports have no picture of the surface; surveys do not need it"
     )

@@ -33,13 +33,14 @@ LIGHT = np.array([-0.5, 0.7, -0.5])
 WHITE = (1.0, 1.0, 1.0, 0.0)
 
 
-def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Image | None:
+def surface_picture(mesh_file: Path, map_from_world: Array | None = None, limit_s: float = LIMIT_S) -> Image | None:
     """Returns an oblique view of the mesh from the south-south-east, (h, w, 3) RGB; None if it cannot be rendered.
 
     Args:
         mesh_file: the mesh in the world (`twin.exchange.mesh.map_mesh`).
         map_from_world: (4, 4) pose of the world in the map, whose axes are east, north and up of the picture; None: the
             identity.
+        limit_s: time limit of the rendering process.
     """
     from twin.report.images import read_rgb
 
@@ -50,7 +51,7 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
             picture = Path(folder) / "surface.png"
             pose = json.dumps(np.eye(4).tolist() if map_from_world is None else map_from_world.tolist())
             command = [sys.executable, "-P", "-m", __name__, str(mesh_file), str(picture), pose]
-            subprocess.run(command, capture_output=True, timeout=LIMIT_S, check=True)
+            subprocess.run(command, capture_output=True, timeout=limit_s, check=True)
             return read_rgb(picture)
     except (OSError, subprocess.SubprocessError):
         return None

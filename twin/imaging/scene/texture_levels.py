@@ -87,9 +87,9 @@ def add_samples(texture, x, y, level, weight, at, n, shares, cells, total):
                 upper = whole[i] - lower
                 weights = upper - s * upper, s * upper, lower - s * lower, s * lower
                 if number[i] == 0:
-                    red, green, blue = sum_of_texels(finest, start, 3 * width, weights)
+                    red, green, blue = sum_of_texels(finest, start, 3 * width, weights)  # pyright: ignore
                 else:
-                    red, green, blue = sum_of_texels(coarser, start, 3 * width, weights)
+                    red, green, blue = sum_of_texels(coarser, start, 3 * width, weights)  # pyright: ignore
                 k = 3 * at[i]
                 total[k] += red
                 total[k + 1] += green

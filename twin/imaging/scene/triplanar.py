@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.height_field import rises
-from twin.core.records import Array, Image
+from twin.core.records import Image
 from twin.imaging.scene import pixel_rows as px
 from twin.imaging.scene.texture_levels import TextureLevels, add_samples, level_of, levels_of
 from twin.kernels import kernel
 from twin.terrains import Terrain
 
+Coordinates = NDArray[np.floating]
 MOST_SAMPLES = 4  #: largest number of samples along the major axis of a footprint
 _FAST = {"contract", "arcp", "nsz", "reassoc"}
 
@@ -51,7 +52,7 @@ def wall_surface(terrain: Terrain) -> WallSurface:
 
 
 def paint_walls_from_above(
-    terrain: Terrain, surface: WallSurface, albedo: Image, x_m: Array, y_m: Array, step_m: float
+    terrain: Terrain, surface: WallSurface, albedo: Image, x_m: Coordinates, y_m: Coordinates, step_m: float
 ) -> None:
     """Blends the texture of the walls into a parallel view (rows, cols, 3) of a floor from above, in place.
 
