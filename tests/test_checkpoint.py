@@ -15,11 +15,14 @@ from kill_and_resume import differences, leftovers
 from twin import survey
 from twin.core import checkpoint
 from twin.core.checkpoint import FOLDER, Checkpoints
+from twin.core.interrupts import StageGuard
 from twin.core.series import GrowingArray
 from twin.errors import TwinError
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.tiles import TiledRaster
 from twin.scenario.file import input_files, load_scenario
+from twin.session.conclusion import Estimation
+from twin.studies.results_log import cut_torn_line
 
 SMALL = [
     "terrain.size_m=[5.0, 4.0]",
@@ -272,3 +275,45 @@ def test_a_finished_survey_of_another_scenario_is_not_resumed(tmp_path, monkeypa
     (tmp_path / "metrics.json").write_text("{}")
     with pytest.raises(TwinError, match="has another survey, which is finished"):
         survey.run(load_scenario("reef"), Path(tmp_path), resume=True)
+
+
+def test_a_study_refuses_an_input_file_that_has_changed_and_takes_new_ones(tmp_path):
+    dem, texture = tmp_path / "dem.tif", tmp_path / "sand.png"
+    dem.write_bytes(b"heights")
+    checkpoint.check_inputs(tmp_path, [dem])
+    texture.write_bytes(b"sand")
+    checkpoint.check_inputs(tmp_path, [dem, texture])
+    texture.write_bytes(b"mud")
+    with pytest.raises(TwinError, match="sand.png has changed since"):
+        checkpoint.check_inputs(tmp_path, [dem, texture])
+
+
+def test_a_torn_last_line_of_a_journal_is_removed(tmp_path):
+    file = tmp_path / "optuna.journal"
+    cut_torn_line(file)
+    file.write_bytes(b'{"op": 1}\n{"op"')
+    cut_torn_line(file)
+    assert file.read_bytes() == b'{"op": 1}\n'
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("arguments", [["schema"], ["export", "--list"]])
+@pytest.mark.parametrize(
+    "streams, status, message", [("> /dev/full", 2, "stdout: No space left on device"), (">&-", 0, ""), ("2>&-", 0, "")]
+)
+def test_a_full_disk_or_a_closed_stream_costs_one_line_at_most(arguments, streams, status, message):
+    command = f"{sys.executable} -m twin {' '.join(arguments)} {streams}"
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert ended.returncode == status
+    assert ended.stderr.startswith(message) and len(ended.stderr.splitlines()) <= 1
+
+
+def test_an_image_that_a_full_disk_lost_costs_the_map_and_not_the_trajectories():
+    class Navigator:
+        def build_map(self, *_):
+            raise OSError(28, "No space left on device")
+
+    guard = StageGuard()
+    estimation = Estimation(Navigator(), None, guard, None, lambda *_: None, 0.0)
+    assert estimation.build_map(None, None) is None
+    assert guard.reason == "[Errno 28] No space left on device"

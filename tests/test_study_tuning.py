@@ -1,5 +1,6 @@
 """A search finds the best feasible plan, confirms it with new seeds, and does not depend on interruptions."""
 
+import optuna
 import pyarrow.parquet as pq
 import pytest
 import study_surveys
@@ -108,6 +109,26 @@ def test_an_interrupted_search_ends_with_the_same_candidates(searched, tmp_path)
     again = search(study, tmp_path / "out", resume=True)
     assert again.candidates == whole.candidates
     assert again.finalists == whole.finalists
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+def test_a_search_killed_while_it_chooses_a_batch_ends_with_the_same_candidates(searched, tmp_path, monkeypatch):
+    study, whole, _ = searched
+    asked, ask = [], optuna.Study.ask
+
+    def ask_until_killed(self, *arguments):
+        if len(asked) == 8:  # the third candidate of the second batch
+            raise Killed
+        asked.append(ask(self, *arguments))
+        return asked[-1]
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(optuna.Study, "ask", ask_until_killed)
+        search(study, tmp_path / "out")
+    assert search(study, tmp_path / "out", resume=True).candidates == whole.candidates
 
 
 @pytest.fixture

@@ -157,6 +157,8 @@ def _fly_recorded(
     survey.loop, survey.recorder, survey.flown = None, None, True
     checkpoints.save_last(survey)
     if checkpoints.problem:
+        checkpoints.remove()  # a full disk needs the space for the results
+    if checkpoints.problem:
         survey.folder.log("no checkpoint", reason=checkpoints.problem)
 
 

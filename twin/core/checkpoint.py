@@ -143,6 +143,13 @@ class Checkpoints:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
+def remove_if_finished(run: Path) -> bool:
+    """Returns whether a run has ended, and then removes the checkpoints that it leaves if it is killed at its end."""
+    if is_file(run / "metrics.json"):
+        shutil.rmtree(run / FOLDER, ignore_errors=True)
+    return is_file(run / "metrics.json")
+
+
 def file_hash(file: Path) -> str:
     """Returns the SHA-256 of a file; "" if it cannot be read."""
     try:

@@ -38,9 +38,16 @@ class Estimation(NamedTuple):
     def build_map(
         self, result: SurveyResult, grid: MapGrid | None, chosen: NDArray[np.bool_] | None = None
     ) -> ElevationMap | None:
-        """Returns the elevation map from the chosen keyframes; None without any, or if an interrupt ends the stage."""
+        """Returns the elevation map from the chosen keyframes; None without any, or if an interrupt ends the stage.
+
+        It is also None if an image could not be read, or the last one not written; `guard.cause` then says why.
+        """
         report = partial(self.progress, "map")
-        return self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))
+        try:
+            return self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))
+        except OSError as error:
+            self.guard.cause = self.guard.cause or str(error)
+            return None
 
 
 class Maps(NamedTuple):
