@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import brentq, root
 
 from twin.errors import ScenarioError
+from twin.imaging.camera import true_cameras
 from twin.imaging.camera.port import air_coordinates, pinhole, refract, water_rays
 from twin.imaging.camera.ray_sampling import sample_rays
 from twin.imaging.camera.true_cameras import make_true_cameras
@@ -271,3 +272,18 @@ def test_a_field_of_view_beyond_the_port_is_rejected():
     wide = ["rig.hfov_deg=110.0", "port.kind=flat", "port.calibrated_at_m=2.0"]
     with pytest.raises(ScenarioError, match=r"rig\.hfov_deg: no rays reach the corners of the frame"):
         prepare(load_scenario("reef", wide))
+
+
+def test_the_true_cameras_of_a_seed_do_not_depend_on_those_made_before():
+    """Rays of lens and port are kept from call to call; the rotation of the right camera is that of the seed."""
+    drawn = [scenario(port=DOME, calibration_error={"rotation_sigma_deg": 0.1}, seed=seed) for seed in (1, 2)]
+    fresh = []
+    for one in drawn:
+        true_cameras._sensor_rays.cache_clear()
+        true_cameras._rectification.cache_clear()
+        fresh.append(make_true_cameras(one).sampling)
+    again = [make_true_cameras(one).sampling for one in (drawn[0], drawn[1])]
+    for (left, right), (kept_left, kept_right) in zip(fresh, again, strict=True):
+        np.testing.assert_array_equal(left.positions, kept_left.positions)
+        np.testing.assert_array_equal(right.positions, kept_right.positions)
+    assert np.abs(fresh[0][1].positions - fresh[1][1].positions).max() > 0.1

@@ -1,8 +1,10 @@
 """Figures and numbers of the pages: which bar is which, labels of logarithmic axes, units of limits."""
 
+import base64
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import matplotlib
 import numpy as np
 import pytest
@@ -107,3 +109,15 @@ def test_a_map_of_a_scene_without_coordinates_has_no_other_axes():
     _, axes = plotting.one_panel(4.0)
     plotting.add_coordinates(axes, None)
     assert not axes.child_axes
+
+
+def test_a_figure_has_no_margins_but_the_padding():
+    """Size against the tight bounding box of matplotlib, to 3 px of anti-aliased lines."""
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure, axes = plotting.one_panel(4.0)
+        axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xlabel="east [m]")
+        data = base64.b64decode(plotting.to_data_uri(figure).partition(",")[2])
+        padded = (figure.get_tightbbox().size + 2 * plotting.PAD_IN) * figure.dpi
+    rows, cols, _ = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape
+    np.testing.assert_allclose([cols, rows], np.minimum(padded, figure.get_size_inches() * figure.dpi), atol=3)
+    assert cols < plotting.WIDTH_IN * figure.dpi / 2

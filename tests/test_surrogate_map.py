@@ -285,3 +285,17 @@ def test_errors_of_depth_follow_the_bound_at_the_position_in_the_image():
 def test_a_height_that_is_not_a_number_is_an_error_and_not_a_hole():
     with pytest.raises(FloatingPointError, match="height"):
         patch_of(map_model_over(BUMPY), EXACT._replace(lateral_sigma_px=np.nan), tilted(0.1, 0.2, 2.0))
+
+
+def test_the_cells_that_a_keyframe_sees_project_into_both_images():
+    """Against the projection of the calibration, over a floor without cells that relief may hide."""
+    model, pose = map_model_over(BUMPY), tilted(0.1, 0.2, 2.0)
+    model.mark_seen(pose)
+    x, y = np.meshgrid(*model.grid.centres())
+    centres = np.column_stack([x.ravel(), y.ravel(), model.height_m.ravel()])
+    inside = np.ones(len(centres), np.bool_)
+    for camera in (pose, pose @ RIG.left_from_right):
+        pixels = RIG.project(geometry.transform(geometry.inverse(camera), centres))
+        inside &= np.all((pixels >= 0) & (pixels <= [RIG.width_px - 1, RIG.height_px - 1]), axis=1)
+    assert 5000 < inside.sum() < inside.size
+    np.testing.assert_array_equal(model.seen.ravel(), inside)

@@ -119,7 +119,7 @@ def _right_camera(cameras, true):
     return right
 
 
-@kernel
+@kernel(inline="always")
 def _seen(cells, cameras, cell, point, camera_from_world, left, right):
     """Returns depth, column and row of a cell's floor point in the left image, and its distance from the next border.
 
@@ -209,7 +209,7 @@ def extend_runs(runs, index, border_px, information, following, squared_step):
     return ended[:n], of_ended
 
 
-@kernel
+@kernel(inline="always")
 def _source(cells, cameras, cell, camera_from_world, estimated):
     """Returns the true floor point that is mapped to a cell: its centre minus the mapping error.
 

@@ -10,6 +10,7 @@ a field says otherwise, the standard deviations that the estimators report are t
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -94,7 +95,7 @@ class ErrorModel(NamedTuple):
             stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
         """
         relief_px = self.stereo_relief_gain * stereo_parallax_px
-        return float(np.sqrt(self.match_floor_px**2 + (self.efficiency * bound_px) ** 2 + relief_px**2))
+        return math.sqrt(self.match_floor_px**2 + (self.efficiency * bound_px) ** 2 + relief_px**2)
 
     def difference_sigma_px(self, bound_px: Array | float) -> Array:
         """Returns the standard deviation of a flow vector or of a disparity at Cramér-Rao bounds [px]."""

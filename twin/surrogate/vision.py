@@ -69,20 +69,21 @@ class KeyframeTruth(NamedTuple):
     cells: Cells  #: (n,) floor cells of the points
     clear_share: float  #: fraction of the matches that remain in the presence of marine snow
     noise_ratio: float  #: ratio of the scatter of the row differences to that expected from noise (`MeasuredRows`)
+    disparity: float  #: mean normalised disparity of the points
 
     @property
     def stereo_parallax_px(self) -> float:
         """Returns the RMS parallax of the relief in a patch between the two cameras."""
-        return self.unevenness_px * float(np.mean(self.points[:, 2]))
+        return self.unevenness_px * self.disparity
 
     def parallax_px(self, earlier_pose: Array) -> float:
         """Returns the RMS parallax of the relief in a patch between the keyframe and an earlier pose (4, 4)."""
-        distance_m = float(np.linalg.norm(self.pose[:3, 3] - earlier_pose[:3, 3]))
-        return self.unevenness_px * distance_m * float(np.mean(self.points[:, 2])) / self.baseline_m
+        moved_m = self.pose[:3, 3] - earlier_pose[:3, 3]
+        return self.unevenness_px * math.sqrt(moved_m.dot(moved_m)) * self.disparity / self.baseline_m
 
     def distance_in_depths(self, a_from_b: Array) -> float:
         """Returns the length of a motion's translation multiplied by the mean inverse depth of the points."""
-        return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self.points[:, 2]) / self.baseline_m)
+        return float(np.linalg.norm(a_from_b[:3, 3])) * self.disparity / self.baseline_m
 
 
 class FrameErrors(NamedTuple):
@@ -225,6 +226,7 @@ class SurrogateVision:
         latest = self._latest = KeyframeTruth(
             pose, points, hits, noise, bound_px, matchability.unevenness_at(mean_m), n_points, rig.baseline_m, unit_cov,
             floor_cells(pose, points, rig.baseline_m), matchability.clear_share_at(mean_m), noise_ratio,
+            float(np.mean(points[:, 2])),
         )  # fmt: skip
         sigma_px = self.model.match_sigma_px(bound_px, latest.stereo_parallax_px) * np.sqrt(n / n_points)
         measured = measured + noise.reshape(-1, 3)[hits] @ (self._unit_root.T * sigma_px)
@@ -324,7 +326,7 @@ class SurrogateVision:
         match_fraction = min(later.clear_share, earlier.clear_share) * model.rematched(bound_px)
         n_matches = later.n_points * match_fraction
         inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
-        noise_scale, single = np.sqrt(n / n_matches * inflation), n / n_matches
+        noise_scale, single = math.sqrt(n / n_matches * inflation), n / n_matches
         sigma_px, lamp_factor = stereo_sigma_px * noise_scale, model.lamp_factor(self.matchability.lamp_share)
         in_view, motion, cov, yaw = sampling.sample_link(
             later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise,
@@ -340,9 +342,9 @@ class SurrogateVision:
             return None
         # relief increases the variance of the difference of a match's two image positions, 2 sigma^2 without it
         growth = 1 + (model.relief_gain * parallax_px) ** 2 / (2 * stereo_sigma_px**2)
-        residual = np.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
-        found = Motion(motion, cov * growth, n_matched, float(residual))
-        if not np.isfinite(yaw[1]):
+        residual = math.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
+        found = Motion(motion, cov * growth, n_matched, residual)
+        if not math.isfinite(yaw[1]):
             return found
         return found._replace(yaw=YawEffect(yaw_rad + yaw[0], yaw[1] * growth**0.5, yaw[2:], yaw_rad))
 
