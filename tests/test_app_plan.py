@@ -1,6 +1,9 @@
 """Summary of a plan: expected errors, requirements, warnings, cost, JSON."""
 
 import json
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
+from twin.bench.measurement import child_ms
 from twin.planning import expected_error
 from twin.planning import summary as plan_summary
 from twin.planning.expected_error import ExpectedError
@@ -147,6 +151,27 @@ def test_the_cost_grows_with_frames_keyframes_and_pixels(summary):
         assert bigger.cost.wall_s > summary.cost.wall_s and bigger.cost.disk_mb > summary.cost.disk_mb
         assert bigger.cost.memory_mb > summary.cost.memory_mb
     assert summary_of("imaging.fidelity=surrogate").cost.wall_s < summary.cost.wall_s
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fidelity", ["rendered", "surrogate"])
+def test_time_memory_and_disk_of_a_run_are_about_those_expected(tmp_path, fidelity):
+    """Within 30 %; the time within a factor of two, as it depends on the processor and its load."""
+    overrides = ["plan.tracks=1", "plan.area_m=[1.6,0.8]", "control.hold_s=0.5", f"imaging.fidelity={fidelity}"]
+    expected, folder = plan_summary.summarise(prepare(load_scenario("reef", overrides))).cost, tmp_path / "run"
+    child_ms("-c", f"import twin; twin.run('reef', '{folder}', {overrides})")  # compiles what is not on disk
+    shutil.rmtree(folder)
+    code = f"""
+import time, twin
+twin.run('reef', '{folder}', {overrides})
+print(time.process_time(), open('/proc/self/status').read().split('VmHWM:')[1].split()[0])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    processor_s, peak_kib = map(float, done.stdout.split()[-2:])
+    assert expected.wall_s / 2 < processor_s < expected.wall_s * 2
+    assert peak_kib * 1024 / 1e6 == pytest.approx(expected.memory_mb, rel=0.3)
+    size_mb = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e6
+    assert size_mb == pytest.approx(expected.disk_mb, rel=0.3)
 
 
 def test_the_summary_is_json(summary):

@@ -29,12 +29,10 @@ def survey_rows(label: str, scene: str, overrides: Sequence[str], n_rounds: int)
     """Returns the rows of a small survey of a scene: its processor time, report, recording, folder and accuracy."""
     flown = np.array([_survey(scene, overrides) for _ in range(n_rounds)]).T
     names = "processor time", "report", "recording"
-    floors = "mujoco.Renderer, same views", "matplotlib, as many empty PNG", "cv2, its images as JPEG"
+    calls = "mujoco.Renderer, same views", "matplotlib, as many empty PNG", "cv2, its images as JPEG"
+    timed = zip(names, flown[:6:2], calls, flown[1:6:2], strict=True)
     return [
-        *(
-            BenchmarkRow(f"{label}: {name}", "ms", flown[2 * k], floors[k], flown[2 * k + 1])
-            for k, name in enumerate(names)
-        ),
+        *(BenchmarkRow(f"{label}: {name}", "ms", ours, floor, floors) for name, ours, floor, floors in timed),
         BenchmarkRow(f"{label}: run folder", "MB", flown[6]),
         BenchmarkRow(f"{label}: final position error (RMSE)", "mm", flown[7, :1]),
         BenchmarkRow(f"{label}: map error (LE90)", "mm", flown[8, :1]),

@@ -1,11 +1,9 @@
 """Computing cost of a survey: time, memory and disk, estimated from its plan.
 
-The coefficients are fitted to four rendered surveys of `reef` (area 1.2 m x 0.8 m, one track, 413 frames; images
-of 320 x 240 and 640 x 480 px, 19 and 51 keyframes) on a 2-core x86-64 machine without GPU: 30, 39, 47 and 71 s of
-processor time, 485, 502, 585 and 657 MB of memory, 11, 22, 28 and 65 MB of disk. The machine was fully loaded, so
-the time coefficients are multiplied by 0.6; they then reproduce the 46 s of processor time of `reef` on an idle
-machine. The coefficients of the surrogate are fitted to `horseshoe` with 50 and 362 keyframes (16 and 22 s on the
-loaded machine). Times on other machines can differ by a factor of two.
+The coefficients of rendered surveys are the times of the stages per frame and per keyframe that `twin bench` measures,
+at 320 x 240 and 640 x 480 pixels; the start is what a whole run of `reef` takes beyond these (imports, opening of the
+world, report, recording). Memory is the peak of the whole process, which the report reaches. Measured on a 2-core
+x86-64 machine without GPU, where compiled code is kept on disk; other machines may differ by a factor of two.
 """
 
 from typing import NamedTuple
@@ -14,7 +12,7 @@ from twin.world.mission import Mission
 
 
 class ComputingCost(NamedTuple):
-    wall_s: float  #: processor time on an idle 2-core machine [s]
+    wall_s: float  #: processor time, of all threads [s]
     memory_mb: float  #: peak memory [MB]
     disk_mb: float  #: disk space of the run folder [MB]
 
@@ -33,13 +31,15 @@ class _Coefficients(NamedTuple):
         return self.start + n_frames * frame + n_keyframes * (self.keyframe + self.keyframe_mpx * megapixels)
 
 
-_RENDERED_S = _Coefficients(start=11.0, frame=0.0066, frame_mpx=0.048, keyframe=0.066, keyframe_mpx=1.25)
-_SURROGATE_S = _Coefficients(start=9.0, frame=1e-4, keyframe=0.01)
-_RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=3.6)
-_SURROGATE_DISK_MB = _Coefficients(start=15.0, keyframe=0.02)
-_RENDERED_MB = _Coefficients(start=415.0, keyframe_mpx=7.0)
+_RENDERED_S = _Coefficients(start=9.7, frame=0.0087, frame_mpx=0.221, keyframe=0.07, keyframe_mpx=3.0)
+_OBJECTS_S = _Coefficients(start=4.0, frame=0.022)  # in addition, with objects in the images
+_WALLS_S = _Coefficients(start=0.0, frame=0.03)  # in addition, over a floor with walls
+_SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
+_RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=4.2)
+_SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
+_RENDERED_MB = _Coefficients(start=813.0, keyframe_mpx=7.0)
 _IMAGES_MB_PER_MPX = 300.0
-_SURROGATE_MB = 380.0
+_SURROGATE_MB = 670.0
 #: Memory of the floor [MB] of a rendered survey, per node of the height grid and per texel (see `terrains.terrain`).
 _NODE_MB, _TEXEL_MB = 400e-6, 9e-6
 _WALL_CELL_MB, _WALL_TEXEL_MB = 36e-6, 14e-6  #: memory of walls [MB], per steep cell and per texel of their texture
@@ -54,7 +54,9 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
     window_tracks = mission.scenario.estimator_settings().window_tracks
     window = round(n_keyframes * min(1.0, (window_tracks + 1) / len(mission.tracks)))
     memory_mb = _RENDERED_MB.total(mission.n_frames, window, megapixels) + _IMAGES_MB_PER_MPX * megapixels
-    return ComputingCost(_RENDERED_S.total(*size), memory_mb + _floor_mb(mission), _RENDERED_DISK_MB.total(*size))
+    time_s = _RENDERED_S.total(*size) + (_OBJECTS_S.total(*size) if mission.objects else 0.0)
+    time_s += 0.0 if mission.terrain.walls is None else _WALLS_S.total(*size)
+    return ComputingCost(time_s, memory_mb + _floor_mb(mission), _RENDERED_DISK_MB.total(*size))
 
 
 def _floor_mb(mission: Mission) -> float:

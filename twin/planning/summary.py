@@ -107,7 +107,7 @@ def _latency(mission: Mission) -> Latency | None:
 
 
 def run_time_s(mission: Mission) -> float:
-    """Returns the expected processor time of a survey on an idle machine [s]."""
+    """Returns the expected processor time of a survey [s]."""
     plane = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
     return computing_cost(mission, plane.n_keyframes).wall_s
 
@@ -251,7 +251,7 @@ def _swath_spacing(mission: Mission) -> str:
 def _cost_text(cost: ComputingCost) -> str:
     minutes = cost.wall_s / 60
     time = f"{cost.wall_s:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
-    return f"about {time} on 2 cores, {cost.memory_mb / 1000:.1f} GB of memory, {cost.disk_mb:.0f} MB of disk"
+    return f"about {time} of processor time, {cost.memory_mb / 1000:.1f} GB of memory, {cost.disk_mb:.0f} MB of disk"
 
 
 def floor_rows(summary: PlanSummary) -> list[tuple[str, ...]]:
