@@ -1,7 +1,5 @@
 """MuJoCo model of a free-floating vehicle, which is a mass without a shape."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

@@ -1,7 +1,5 @@
 """MuJoCo, which is imported from here only, when it is first used. Surveys need none of its OpenGL."""
 
-from __future__ import annotations
-
 import os
 from functools import cache
 from typing import Any, TypeAlias

@@ -1,7 +1,5 @@
 """Complete survey: plan, fly and estimate track by track, build the map, compare with the truth, write the report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import dataclass, replace

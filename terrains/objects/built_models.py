@@ -1,7 +1,5 @@
 """Models of the built-in shapes, kept on disk from run to run: to build those of a reef takes seconds."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Rows of the benchmark: processor time of all threads beside that of a floor, measured in turn in one process."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys

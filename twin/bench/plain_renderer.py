@@ -1,7 +1,5 @@
 """Plain rendering of a floor by `mujoco.Renderer`: one textured mesh, without light and water."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stages of a rendered survey, each beside its floor on the same images."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

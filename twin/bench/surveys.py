@@ -1,7 +1,5 @@
 """Whole surveys: their cost beside the plain rendering of their frames, and their accuracy; surrogate, alignment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec

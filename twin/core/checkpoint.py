@@ -4,8 +4,6 @@ A state is a pickle, and reading a pickle can run any code. Its hash, which is c
 not malice: resume only in a folder that nobody else can write.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

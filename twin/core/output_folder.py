@@ -1,7 +1,5 @@
 """Output folders: one process at a time writes a folder, and results are not mixed with what it already contains."""
 
-from __future__ import annotations
-
 import errno
 import os
 import platform

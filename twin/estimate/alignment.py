@@ -4,8 +4,6 @@ The mixed adjustment model (Negahdaripour & Madjidi 2003, eq. 7) reduces to one 
 factor graph with a Huber loss on the links. Outlier links are removed and reported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

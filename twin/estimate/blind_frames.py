@@ -1,7 +1,5 @@
 """Frames whose motion was predicted, not measured: their poses between the measured frames before and after them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ Lengths are compared with those of DVL, USBL and pressure. An error of the basel
 length only those along the optical axis, whose scale is observable only where the camera moves along it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 

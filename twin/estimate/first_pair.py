@@ -1,7 +1,5 @@
 """Inspection of recorded stereo images before a survey is estimated: matches, order of the cameras, floor, light."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import NamedTuple
 

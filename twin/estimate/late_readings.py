@@ -1,7 +1,5 @@
 """Readings that are older than the last frame, or that no node has: their motion to the time at which they are used."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Selection of the earlier nodes to which a new node is linked, by predicted overlap, and covariances of the links."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import time
 from bisect import bisect_left
 from collections import deque

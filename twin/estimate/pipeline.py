@@ -4,8 +4,6 @@ Frame-to-frame motion (F2F) is estimated at every frame. Stereo matching, regist
 measurement of links are done at keyframes, and the global alignment (GA) at the end of each track and of the survey.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace

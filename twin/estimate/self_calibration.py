@@ -10,8 +10,6 @@ So do errors of image positions that a wrong lens or port leaves (`image_errors`
 are any.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ The limits lie between the values of ordinary surveys and those of surveys with 
 9). An error of disparities is a finding only if positions or heights are wrong by more than their standard deviations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Poses of all frames: their record, and their interpolation between the poses of the keyframes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Image formation: total radiance that reaches a camera, with shadows, forward scatter and marine snow if enabled."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache, partial
 from typing import NamedTuple

@@ -11,8 +11,6 @@ With single scattering, rho = (L - B) / W. Snow, caustics, shadows of objects, b
 are not corrected; the floor is taken to be Lambertian.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -9,8 +9,6 @@ follow a power law n(D) ~ D^-j between a and b (Junge 1963), with the cumulative
 (a^(1-j) - b^(1-j)).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 

@@ -1,7 +1,5 @@
 """Height errors of the elevation map, over the cells that both cameras saw in a keyframe and over the asked area."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Assembly of a survey: world, visual measurements and estimators, as the scenario specifies them."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from contextlib import contextmanager, nullcontext
 from functools import cache

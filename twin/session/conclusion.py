@@ -1,7 +1,5 @@
 """Conclusion of a flown survey or a replay: final alignment, maps, comparison with the truth, and the run folder."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace

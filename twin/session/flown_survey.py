@@ -1,7 +1,5 @@
 """A survey that has been flown in the simulated world: its maps, findings, evaluation and record."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Actions of a mission in poor visibility: the vehicle slows down or stops where few or no motions are measured."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from typing import Literal

@@ -1,7 +1,5 @@
 """Monitoring of a running survey: progress, log, live view, and abort if vision is lost or the position uncertain."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Adaptation of the path in flight: its height to the floor that was measured, and legs over gaps at its end."""
 
-from __future__ import annotations
-
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import Gaps

@@ -1,7 +1,5 @@
 """Changes of path and pace that a controller plug-in asks for at keyframes, within limits."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

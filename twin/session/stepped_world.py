@@ -1,7 +1,5 @@
 """Simulated world that a program advances frame by frame (`twin.World`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path

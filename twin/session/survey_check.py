@@ -1,7 +1,5 @@
 """Checks of a flown survey by estimates and plan alone, as for a real one: path kept, and asked area mapped."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.quality import Finding

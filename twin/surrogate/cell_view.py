@@ -1,7 +1,5 @@
 """Cells of a map that both cameras of a keyframe see, and the heights that are mapped to them (compiled)."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled closed loop of vehicle, sensors, navigator and pilot over the frames between two keyframes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core import geometry

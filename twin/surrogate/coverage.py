@@ -1,7 +1,5 @@
 """Conditions of a survey compared with the conditions of the surveys to which the error model was fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Literal, NamedTuple
 

@@ -8,8 +8,6 @@ times as large. Errors that do not come from noise, of relief, lamps and correla
 a field says otherwise, the standard deviations that the estimators report are the true ones.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

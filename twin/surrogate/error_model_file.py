@@ -1,7 +1,5 @@
 """TOML file of an error model: fitted parameters, number of surveys of the fit, its misfit, and the fitted range."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Relief of the floor within the windows of dense matching, on the grid of a map: slope, roughness and edges."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ median window of dense matching; further keyframes reduce it. Errors due to reli
 walls and of lateral shifts are common to all views of a floor point.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

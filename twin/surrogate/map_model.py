@@ -6,8 +6,6 @@ those of dense matching are. A cell is visible if its centre projects into both 
 either camera (ray casting).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

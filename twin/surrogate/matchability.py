@@ -11,8 +11,6 @@ In turbid water most corners of the full image are noise. The estimators then bi
 bound is that of the binned images, in their pixels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache

@@ -1,7 +1,5 @@
 """Model of the mosaic: for each floor cell, the first keyframe that shows it; later ones do not overwrite the cell."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Sampling of measured motions (compiled): between frames, between keyframes, and relative to the mosaic."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core import geometry

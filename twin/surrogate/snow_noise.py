@@ -6,8 +6,6 @@ weight, 1 / variance, is smaller. A patch that particles change too much is not 
 images is too low. Images, defocus and illumination of the particles are computed by `imaging.snow`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """Simulated world without images, objects and overhangs; vehicle and sensors are modelled as in `RenderedWorld`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -7,8 +7,6 @@ same equations as from matched points. The noise of a stereo pair is sampled onc
 in full if it is the later one of the link, else with the fraction `ErrorModel.match_bias_fraction`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

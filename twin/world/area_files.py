@@ -1,7 +1,5 @@
 """Survey areas in files of other programs: polygons of KML, surveys of a plan of QGroundControl."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree
 

@@ -1,7 +1,5 @@
 """Placement of the survey area in the scene: centre, heading, and polygon from a list or a file."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Floor as it is known before a survey, over which the survey is planned; the true one may differ from it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

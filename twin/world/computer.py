@@ -1,7 +1,5 @@
 """Latency of the computer on the vehicle: time from an image to the command that follows from it."""
 
-from __future__ import annotations
-
 import math
 
 from twin.controllers.survey_plan import SurveyPlan

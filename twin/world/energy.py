@@ -1,7 +1,5 @@
 """Energy of a survey, planned or flown, from the velocities through the mean current."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core import geometry

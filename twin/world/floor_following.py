@@ -1,7 +1,5 @@
 """Path at a height above a floor that is not known: its heights follow the floor as measured so far."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 

@@ -1,7 +1,5 @@
 """Forecast of a survey over its floor: depth, footprint, overlap and coverage of the planned images by ray casting."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from typing import NamedTuple

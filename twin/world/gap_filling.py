@@ -1,7 +1,5 @@
 """Gaps of a survey: parts of the area that too few keyframes show, and legs over them after the last track."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

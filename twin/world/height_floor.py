@@ -1,7 +1,5 @@
 """Sea floor of a scenario as a height grid: generated, or read from its files."""
 
-from __future__ import annotations
-
 from twin import terrains
 from twin.plugin.guard import terrain_heights
 from twin.scenario.model import Scenario

@@ -5,8 +5,6 @@ highest surface at each cell. Below the rendered tiles lies a height grid of the
 so that it is seen only through holes of the mesh; holes have the height and the colour of the nearest node of the mesh.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

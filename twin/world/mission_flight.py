@@ -1,7 +1,5 @@
 """Flight of a mission frame by frame: sequence of the planned frames and times of the global alignments."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

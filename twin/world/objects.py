@@ -1,7 +1,5 @@
 """Objects of a scenario: loaded or built, and placed on the floor."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from pathlib import Path

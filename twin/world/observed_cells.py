@@ -1,7 +1,5 @@
 """Cells of the map that both cameras saw in at least one keyframe, computed from true depth images."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Obstacles with which the hull of the vehicle may come into contact: the floor and the objects of a mission."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

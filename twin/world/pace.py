@@ -1,7 +1,5 @@
 """Pace of the vehicle along its planned path: full, or slowed down to a stop, as a time scaling of the reference."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Transition of the path to other heights or another offset."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks of the planned path: over the floor, clear of floor and objects, within the thrust of the vehicle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

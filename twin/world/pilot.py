@@ -1,7 +1,5 @@
 """Pilot: computes the vehicle command from the online estimate of the camera's pose and velocity."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Survey planning over a floor: spacing that keeps the required overlap there, and a path that follows the floor."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulated world with rendered images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

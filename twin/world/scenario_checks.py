@@ -1,7 +1,5 @@
 """Contradictions of a scenario that no range of a single key excludes: between keys, or keys without effect."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

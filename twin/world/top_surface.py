@@ -3,8 +3,6 @@
 Below an overhang, the map has the height of the object. Plants are upright, as in still water.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import ceil

@@ -4,8 +4,6 @@ The order is SuperLU's multiple minimum degree order of A' + A. Nodes on a path 
 same pattern below the diagonal form a supernode, whose columns are one dense matrix, a panel.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -9,8 +9,6 @@ They add rows and columns, the border, to the normal equations, which the Schur 
 solves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

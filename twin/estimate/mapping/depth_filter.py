@@ -1,7 +1,5 @@
 """Kalman depth filter along the path; depths that are not propagated to the next keyframe enter the map, each once."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

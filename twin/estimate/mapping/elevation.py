@@ -1,7 +1,5 @@
 """Fusion of height patches into the elevation map by a Kalman filter of each cell."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

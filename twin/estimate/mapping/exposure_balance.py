@@ -9,8 +9,6 @@ with the colour a_c, the exposure g_k and the pattern b of the lamps, common to 
 zero-mean priors on g and b, for each colour band.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

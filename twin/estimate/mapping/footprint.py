@@ -1,7 +1,5 @@
 """Grid of a map that covers the keyframe images of a survey, and its division into tiles where it has many cells."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Construction of the map from the stereo pairs along the final trajectory: depth filter, heights and orthomosaic."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture, made tile by tile."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Protocol
 

@@ -6,8 +6,6 @@ large that the view nearest to nadir, where errors of height displace least, dom
 times the weight. Pixels hidden by nearer floor are not used.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Conversion of a depth map to heights at the cell centres of a grid, with their variances."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

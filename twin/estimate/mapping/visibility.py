@@ -1,7 +1,5 @@
 """Heights that their camera cannot have seen: usually mismatches, which are too far away and form islands."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

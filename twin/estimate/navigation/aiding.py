@@ -1,7 +1,5 @@
 """Factors of the navigation sensors in the graph of the global alignment; residuals are predicted minus measured."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

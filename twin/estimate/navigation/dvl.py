@@ -1,7 +1,5 @@
 """Integration of DVL velocities: displacements per frame for the online pose, and per node for the global alignment."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kalman updates of a pose with readings, and the gates that reject readings which contradict the pose."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ Visual motion fused with the DVL predicts the pose; registrations with the mosai
 it. Covariances of poses and motions refer to [rotation, translation] (rad, m) in the axes of the current camera.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Watch over the navigation sensors: readings that repeat are removed, and long gaps between readings are reported."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

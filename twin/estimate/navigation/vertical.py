@@ -8,8 +8,6 @@ The specific force f of a body with rotation R (world_from_body) and acceleratio
 R' a as noise: an acceleration of `_ACCELERATION_MPS2`, correlated over `_ACCELERATION_S`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core import geometry

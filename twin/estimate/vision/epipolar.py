@@ -5,8 +5,6 @@ homogeneous coordinates, the projection into the other image is linear in d. The
 linear function of the pixel coordinates u and v.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

@@ -11,8 +11,6 @@ motions is, see `self_calibration`). `_pattern` separates matching noise, which 
 from errors of the calibration.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

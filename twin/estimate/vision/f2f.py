@@ -1,7 +1,5 @@
 """Frame-to-frame motion (F2F) at video rate, by tracking the points of the last keyframe."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ columns of the right image, and of the rows, of which stereo points have the mea
 those of polynomials that are orthonormal over the image.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

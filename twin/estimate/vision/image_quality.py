@@ -1,7 +1,5 @@
 """Quality of an image for matching: contrast, saturation, and ambiguity of repetitive texture."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import cv2

@@ -1,7 +1,5 @@
 """Storage of the keyframes' images and disparities on disk."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor

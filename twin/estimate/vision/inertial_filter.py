@@ -1,7 +1,5 @@
 """Kalman filter of the camera's motion from frame to frame, predicted by an inertial measurement unit (IMU)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core import geometry

@@ -4,8 +4,6 @@ It moves with the cameras. In turbid water dense matching would find its dispari
 is estimated from many keyframes and subtracted, unless the texture dominates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Image normalisation, corners, and Lucas-Kanade tracking between frames (less accurate than `patches`)."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 import cv2

@@ -6,8 +6,6 @@ light): with independent cells, the computed standard deviation of the rotation 
 mrad, so the covariance is that of clustered data (Liang & Zeger 1986), with image blocks as clusters.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f, and disparity / f: depth = baseline / disparity.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measurement of a link: points of a node are matched in the images of an earlier node, and the motion is estimated."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple

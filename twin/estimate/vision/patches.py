@@ -6,8 +6,6 @@ rotation between legs by 0.4 mrad); gradients of brightness and contrast are nui
 because the lamps move (0.01 px); B-splines halve the bias of cubic convolution (0.014 px).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Points of images whose rows are exposed one after the other, as if all were exposed at mid-exposure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

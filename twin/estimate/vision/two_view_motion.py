@@ -4,8 +4,6 @@ A motion is the pose of the later camera in the earlier one, or its twist [w, t]
 in `observation_equations`. Equation numbers are those of Negahdaripour & Madjidi 2003.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Search of a link over the whole images: where the prediction is too uncertain, features give a coarse motion."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -6,8 +6,6 @@ With x = X / Z, y = Y / Z and r^2 = x^2 + y^2, the distorted coordinates in unit
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -10,8 +10,6 @@ with the aperture A, the depth s in focus and the focal length f in water [px] (
 over the disc of its own depth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Physical sensor (section [sensor] of a scenario): radiance to digital numbers; exposure and read-out time."""
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import cv2

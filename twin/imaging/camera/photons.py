@@ -13,8 +13,6 @@ with S the sensitivity relative to its largest value, Km = 683 lm/W, and V the p
 with L the radiance in water of index n. Off the axis it decreases as a power (four by default) of the cosine.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ The linear model of EMVA 1288: Poisson-distributed electrons, normal read noise,
 noise), clipped to the largest digital number. Dark current and non-uniformity are not modelled.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

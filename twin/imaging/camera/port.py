@@ -6,8 +6,6 @@ water of index n, it lies d (n - 1) + t (n / g - 1) behind the pupil and has n t
 2012 (doi 10.1109/TPAMI.2011.105) give the errors off the axis.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Counter-based random numbers for the pixels of an image; they do not depend on the order or number of threads."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

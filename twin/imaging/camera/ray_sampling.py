@@ -6,8 +6,6 @@ floor of depth z at the column f d_x / d_z + f (o_x - o_z d_x / d_z) / z from th
 solved by iteration for a whole row, from the depths that the rays of the previous row meet.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

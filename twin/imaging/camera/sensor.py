@@ -1,7 +1,5 @@
 """Plain sensor model in fractions of full scale for scenarios without [sensor]: unlimited gain, zero exposure time."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

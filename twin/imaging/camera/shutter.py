@@ -12,8 +12,6 @@ mid-exposure of the middle row. The flow is constant during the exposure, a path
 backscatter and lamp pattern are blurred like the floor behind them. Beyond the border the last pixel is repeated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

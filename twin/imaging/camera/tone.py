@@ -5,8 +5,6 @@ srgb      V = 12.92 L for L <= 0.0031308, else 1.055 L^(1/2.4) - 0.055    (IEC 6
 log       V = log2(1 + (2^n - 1) L) / n with n = LOG_STOPS
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -5,8 +5,6 @@ and gets the radiance where this ray meets the rendered floor; the raw image is 
 If both true cameras equal the believed ones, the rendered image is used unchanged.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple

@@ -5,8 +5,6 @@ after the path exp(-2 Kd altitude) to the floor and back. Grey world makes the m
 1980), with the lag of the auto-exposure. Factors are at least 1, so that a saturated pixel is white.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

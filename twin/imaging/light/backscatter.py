@@ -4,8 +4,6 @@ The light of a lamp (`lamp_light`), scattered with the coefficient b p(angle), i
 the light of the floor (`spread.camera_mixture`); with single scattering it is attenuated by a + b instead.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -8,8 +8,6 @@ do not resolve (normally distributed deflections), by the disc of the sun, and b
 than the tile focus far below the floor and are left out.
 """
 
-from __future__ import annotations
-
 import threading
 
 import cv2

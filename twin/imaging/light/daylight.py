@@ -3,8 +3,6 @@
 Light that floor and water send back is neglected: 8 % for albedo 0.5 in water of Jerlov type III.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

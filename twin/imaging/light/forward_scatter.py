@@ -8,8 +8,6 @@ to the next, except for the widest (`WIDENED_TAN`). Outside the image, the floor
 the mean albedo of the image.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 

@@ -1,7 +1,5 @@
 """Optical properties of the water and daylight in the water, computed once per scenario."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

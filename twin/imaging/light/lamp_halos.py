@@ -9,8 +9,6 @@ the lamp's beam and with the cosine at the floor.
 The share is computed on a coarse grid of pixels, from those around shadows outwards as far as relief hides light.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -8,8 +8,6 @@ with c the attenuation and S = exp(-a d) times the beam convolved with the kerne
 single scattering. Light that floor and water send back and shadows in scattered light are neglected.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import TypeAlias
 

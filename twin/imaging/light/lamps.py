@@ -1,7 +1,5 @@
 """Light sources of a camera: the lamps in its axes, with beam, intensity and colour, and the daylight."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

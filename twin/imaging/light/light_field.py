@@ -13,8 +13,6 @@ unscattered (delta-M+, Lin et al. 2018, J. Quant. Spectrosc. Radiat. Transf. 208
 line of sight uses the phase function itself (Nakajima & Tanaka 1988, ibid. 40, 51).
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

@@ -12,8 +12,6 @@ psi_i the scattering angle at the distance s from the camera, E_day and B_day il
 (`lamp_light`), a blur of the floor (`forward_scatter`) and blurred backscatter (`backscatter`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple

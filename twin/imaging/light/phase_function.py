@@ -1,7 +1,5 @@
 """Phase functions of sea water: the share of scattered light per unit of solid angle [1/sr], which integrates to 1."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Literal, NamedTuple

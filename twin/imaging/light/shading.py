@@ -3,8 +3,6 @@
 A table lookup takes two loops: the first computes the cell and the fraction within it (`lookup`), the second reads.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.vector_math import LOG2_E, sum_of_entries, two_to

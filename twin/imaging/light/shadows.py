@@ -6,8 +6,6 @@ Pixels of facets that face away are dark without a ray; from them, and from a gr
 completed by region growing.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -10,8 +10,6 @@ from Jerlov's diffuse attenuation, Williamson & Hollins (2022) measured them; at
 the absorption lies between those of 1C and 7C as at the last wavelength with a value (within 0.5 % for 3C).
 """
 
-from __future__ import annotations
-
 import importlib
 import warnings
 from functools import cache

@@ -15,8 +15,6 @@ at the range r, a ray scattered by t at u r meets the floor at tan(beta) = (1 - 
 and absorption on the excess path.
 """
 
-from __future__ import annotations
-
 from functools import cache, lru_cache
 from typing import Literal
 

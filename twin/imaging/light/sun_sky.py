@@ -4,8 +4,6 @@ A ray from the zenith angle t continues at w with sin t = n sin w (Snell), so th
 zenith. A uniform sky of radiance L has there n^2 T(t) L, T being the Fresnel transmittance (Mobley 1994, section 4.2).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

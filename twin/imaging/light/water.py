@@ -1,7 +1,5 @@
 """Optical properties of water: absorption, scattering, phase function, and diffuse attenuation of daylight."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import NamedTuple

@@ -4,8 +4,6 @@ The elevation has the spectrum S(k) = B(k) / k^3, the slopes the variance int B 
 phi from the wind with the density (1 + Delta(k) cos(2 phi)) / (2 pi). The sea is fully developed.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

@@ -1,7 +1,5 @@
 """Compiled random sampling of directions: from the table of a phase function, and in lobes around a direction."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.kernels import kernel

@@ -1,7 +1,5 @@
 """Compiled rays on the floor of the reference, a height field: the normal at a point, and lines of sight."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.height_field import cast_ray, height_field, rises

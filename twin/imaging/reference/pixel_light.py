@@ -1,7 +1,5 @@
 """Monte Carlo estimate of the radiance of one pixel in one colour band, by component, with standard errors."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

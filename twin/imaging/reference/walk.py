@@ -18,8 +18,6 @@ The `axis` of a vertex is what its response depends on: the unit normal of the f
 direction in which the backward path arrived.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.height_field import cast_ray

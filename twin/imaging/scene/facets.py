@@ -4,8 +4,6 @@ The depth of a pixel gives a point in one of the two triangles of a cell, those 
 A normal, which points up, is stored in 32 bits as (nx, ny) / (1 + nz), 16 bits each; its error is below 0.004 deg.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, TypeAlias
 
 import numpy as np

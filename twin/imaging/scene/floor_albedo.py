@@ -4,8 +4,6 @@ The texture is sampled trilinearly at a level as coarse as the longer side of th
 pixels of a row pass through short loops without branches.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ through loops without branches, which list the triangles that face the camera an
 be much smaller than a pixel. Triangles nearer than the near plane in part are clipped.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -16,8 +16,6 @@ Specular highlights of a share F (the rest is reflected as above), D and G of GG
 Daylight, and lamp light that was scattered on its way to the floor, are reflected as by a Lambertian floor.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

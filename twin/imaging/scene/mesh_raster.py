@@ -6,8 +6,6 @@ linear in the image. Triangles are about as large as a pixel, so each part of a 
 loops that write lists, almost without branches. Parts outside the image or facing away are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Colours of textured meshes: trilinear samples of levels as coarse as the most stretched pixel (Williams 1983)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ points that the camera sees, with pixels about twice as large: lamps are not poi
 A point is in the shadow where the map shows an object nearer to the light by more than a bias of some pixels.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Objects in the images of the cameras: drawn over the rendered floor where they are nearer to the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

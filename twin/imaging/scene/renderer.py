@@ -1,7 +1,5 @@
 """Renderer of the floor for a pinhole camera: depth by rasterization, then albedo by depth."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.records import Array, Depth, Image

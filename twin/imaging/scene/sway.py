@@ -1,7 +1,5 @@
 """Plants that lean with the current, by the square of the height, and oscillate at the Strouhal frequency."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from twin.core.geometry import Array

@@ -1,7 +1,5 @@
 """Texture with levels of resolution (mip maps, Williams 1983), and lists of trilinear samples of it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

@@ -5,8 +5,6 @@ several places along the major axis (McCormack et al. 1999, Feline). The steep p
 without branches.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
