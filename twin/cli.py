@@ -602,13 +602,13 @@ def bench(
 
 @app.command()
 def doctor() -> None:
-    """Check packages, disk and OpenGL, and print how to fix a failure."""
+    """Check packages and disk, and print how to fix a failure."""
     from twin.app.doctor import check_machine
 
     checks = check_machine(Path.cwd())
     for check in checks:
         print(check)
-    raise typer.Exit(0 if all(check.ok or check.optional for check in checks) else 2)
+    raise typer.Exit(0 if all(check.ok for check in checks) else 2)
 
 
 @app.command()

@@ -1,27 +1,15 @@
-"""Oblique picture of the mapped surface: mesh.glb rendered with pyrender in a separate process.
+"""Oblique picture of the mapped surface: mesh.glb, drawn by the rasterizer of the cameras."""
 
-A faulty OpenGL driver can crash the process. Therefore `surface_picture` runs this module as a program and returns None
-if the program fails.
-"""
-
-from __future__ import annotations
-
-import json
-import os
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
-if TYPE_CHECKING:  # loading other modules would take most of the time of the program
-    from twin.core.records import Array, Image
+from twin.core import geometry
+from twin.core.records import Array, Image
+from twin.imaging.scene.mesh_raster import NEAR_M, DrawnMesh, Projection, Target, draw_meshes
+from twin.terrains.objects.coloured_mesh import with_colours
 
-#: Time limit of the rendering process; if rendering takes longer, the report has no picture of the surface.
-LIMIT_S = 15.0
 WIDTH_PX, HEIGHT_PX, VFOV_DEG = 1400, 900, 30.0
 #: Viewing direction: depression angle, and angle of the camera's position from south towards east.
 DEPRESSION_DEG, EAST_DEG = 42.0, 20.0
@@ -30,60 +18,50 @@ MARGIN = 1.04  # camera distance / smallest distance with all vertices in view
 FRAMED_PERCENT = (0.2, 99.8)
 #: Direction to the light in the axes of glTF (east, up, south): north-west, as in all maps of the report.
 LIGHT = np.array([-0.5, 0.7, -0.5])
-WHITE = (1.0, 1.0, 1.0, 0.0)
+_FINER = 2  # the picture is drawn with so many times more rows and columns, and reduced
 
 
-def surface_picture(mesh_file: Path, map_from_world: Array | None = None, limit_s: float = LIMIT_S) -> Image | None:
-    """Returns an oblique view of the mesh from the south-south-east, (h, w, 3) RGB; None if it cannot be rendered.
+def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Image | None:
+    """Returns an oblique view of the mesh from the south-south-east, (h, w, 3) RGB, lit from the north-west.
+
+    None without the file, or if it cannot be read.
 
     Args:
         mesh_file: the mesh in the world (`twin.exchange.mesh.map_mesh`).
         map_from_world: (4, 4) pose of the world in the map, whose axes are east, north and up of the picture; None: the
             identity.
-        limit_s: time limit of the rendering process.
     """
-    from twin.report.images import read_rgb
+    import trimesh
 
     if not mesh_file.is_file():
         return None
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            picture = Path(folder) / "surface.png"
-            pose = json.dumps(np.eye(4).tolist() if map_from_world is None else map_from_world.tolist())
-            command = [sys.executable, "-P", "-m", __name__, str(mesh_file), str(picture), pose]
-            subprocess.run(command, capture_output=True, timeout=limit_s, check=True)
-            return read_rgb(picture)
-    except (OSError, subprocess.SubprocessError):
+        mesh = trimesh.load_scene(mesh_file).to_mesh()
+    except (ValueError, KeyError, TypeError, IndexError, OSError):
         return None
-
-
-def render_mesh(mesh: Any) -> Image:
-    """Returns a picture of a coloured trimesh in the axes of glTF (y up), lit from the north-west and cropped to it."""
-    import pyglet
-
-    pyglet.options["headless"] = True  # otherwise pyglet's window module, imported by pyrender, needs X libraries
-    import pyrender
-
-    scene = pyrender.Scene(bg_color=WHITE)
-    mesh.visual.vertex_colors = shaded_colours(mesh.visual.vertex_colors[:, :3], mesh.vertex_normals)
-    scene.add(pyrender.Mesh.from_trimesh(mesh))
-    camera = pyrender.PerspectiveCamera(np.deg2rad(VFOV_DEG), aspectRatio=WIDTH_PX / HEIGHT_PX)
-    scene.add(camera, pose=camera_pose(mesh.vertices))
-    renderer = pyrender.OffscreenRenderer(WIDTH_PX, HEIGHT_PX)
-    flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.SKIP_CULL_FACES
-    rendered: Any = renderer.render(scene, flags)
-    renderer.delete()
-    picture, depth = rendered
-    rows, cols = np.nonzero(depth)
-    return picture[rows.min() : rows.max() + 1, cols.min() : cols.max() + 1]
+    if not len(mesh.vertices):
+        return None
+    mesh.vertices = in_map_frame(mesh.vertices, np.eye(4) if map_from_world is None else map_from_world)
+    colours = shaded_colours(mesh.visual.vertex_colors[:, :3], mesh.vertex_normals)
+    height, width = _FINER * HEIGHT_PX, _FINER * WIDTH_PX
+    focal_px = height / 2 / np.tan(np.deg2rad(VFOV_DEG) / 2)
+    view = Projection(float(focal_px), (width - 1) / 2, (height - 1) / 2, NEAR_M, True)
+    target = Target(np.full((height, width), np.inf, np.float32), np.full((height, width, 3), 255, np.uint8))
+    camera_from_mesh = np.diag([1.0, -1.0, -1.0, 1.0]) @ geometry.inverse(camera_pose(mesh.vertices))
+    draw_meshes([DrawnMesh(with_colours(mesh.vertices, mesh.faces, colours), camera_from_mesh)], view, target)
+    rows, cols = np.nonzero(np.isfinite(target.depth))
+    if not len(rows):
+        return None
+    shown = np.s_[rows.min() // _FINER : rows.max() // _FINER + 1, cols.min() // _FINER : cols.max() // _FINER + 1]
+    picture = cv2.resize(target.albedo, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(picture[shown])
 
 
 def in_map_frame(vertices: Array, map_from_world: Array) -> Array:
     """Returns vertices (n, 3) of a mesh in the world in the frame of its map, both in the axes of glTF [m]."""
     if np.array_equal(map_from_world, np.eye(4)):
         return vertices
-    from twin.core import geometry
-    from twin.exchange.mesh import GLB_FROM_WORLD  # imports trimesh, which only this process needs
+    from twin.exchange.mesh import GLB_FROM_WORLD  # imports trimesh
 
     return geometry.transform(map_from_world, vertices @ GLB_FROM_WORLD) @ GLB_FROM_WORLD.T
 
@@ -115,17 +93,3 @@ def camera_pose(vertices: Array) -> Array:
 
 def _axis_rotation(axis: int, angle_deg: float) -> Array:
     return np.asarray(cv2.Rodrigues(np.deg2rad(angle_deg) * np.eye(3)[axis])[0])
-
-
-def _main(mesh_file: str, picture_file: str, map_from_world: str) -> None:
-    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")  # must be set before pyrender is imported
-    import trimesh
-
-    mesh = trimesh.load_scene(mesh_file).to_mesh()
-    mesh.vertices = in_map_frame(mesh.vertices, np.array(json.loads(map_from_world)))
-    picture = render_mesh(mesh)
-    cv2.imwrite(picture_file, np.ascontiguousarray(picture[..., ::-1]))
-
-
-if __name__ == "__main__":
-    _main(*sys.argv[1:])
