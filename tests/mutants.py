@@ -121,7 +121,7 @@ MUTANTS = [
         ("twin/estimate/late_readings.py", "at = int(np.searchsorted(times_s, time_s - _SAME_S))", "at = int(np.searchsorted(times_s, time_s - _SAME_S)) + 1", "estimate_late_readings"),
         ("twin/simulate/reading_times.py", "self._waiting.append((time_s + delay_s, time_s,", "self._waiting.append((time_s + delay_s, time_s + delay_s,", "simulate_sensors"),
         ("twin/simulate/echo_sounders.py", "np.full(4, -np.cos(tilt))", "np.full(4, -1.0)", "simulate_sensors"),
-        ("twin/estimate/self_check.py", "cov[:, 3:, 3:] += share**2", "cov[:, 3:, 3:] += share", "estimate_self_check"),
+        ("twin/estimate/self_check.py", "cov[:, 3:, 3:] += of_positions**2", "cov[:, 3:, 3:] += of_positions", "estimate_self_check"),
         ("twin/judge/recorded.py", "used = used[1:] if alignment == \"first\" else used", "used = used", "judge_recorded"),
         ("twin/estimate/navigation/dvl.py", "growth, cov = (2 * state.path_m[0] + length) / length,", "growth, cov = (state.path_m[0] + length) / length,", "estimate_positioning estimate_aiding"),
         ("twin/estimate/navigation/pose_filter.py", "[[1, 0, -x / depth], [0, 1, -y / depth]]", "[[1, 0, x / depth], [0, 1, -y / depth]]", "estimate_positioning estimate_aiding"),
