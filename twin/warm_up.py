@@ -5,8 +5,6 @@ survey, and the other gives images of a flat floor to the estimators, which the 
 compiled code on disk and load what the other has compiled before.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time
@@ -34,7 +32,7 @@ def survey(folder: Path) -> None:
     run(load_scenario(_SCENE, _SMALL), folder / "run", outputs=())
 
 
-def estimators(folder: Path) -> ElevationMap | None:
+def estimators(folder: Path) -> "ElevationMap | None":
     """Returns the map of a flat floor from images, with the calibration, noise and settings of the survey."""
     from twin.estimate.pipeline import Navigator
     from twin.estimate.stereo_vision import StereoVision
@@ -51,7 +49,7 @@ def estimators(folder: Path) -> ElevationMap | None:
         return navigator.build_map(navigator.finish())
 
 
-def _frames(rig: StereoRig, depth_m: float) -> Iterator[Frame]:
+def _frames(rig: "StereoRig", depth_m: float) -> "Iterator[Frame]":
     import cv2
     import numpy as np
 

@@ -1,7 +1,5 @@
 """Terminal output: results on stdout, progress and errors on stderr."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os
@@ -87,7 +85,7 @@ def _bar(task: str, *columns: TextColumn) -> Iterator[Callable[..., None]]:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
+def progress_bar() -> "Iterator[Callable[[SurveyProgress], None]]":
     with _bar("survey", TextColumn("{task.fields[note]}")) as update:
         yield lambda now: update(completed=now.share, description=now.stage, note=progress_note(now))
 
@@ -99,7 +97,7 @@ def replay_bar() -> Iterator[Callable[[str, float], None]]:
         yield lambda stage, share: update(completed=share, description=stage)
 
 
-def progress_note(now: SurveyProgress) -> str:
+def progress_note(now: "SurveyProgress") -> str:
     """Returns the progress of a survey as text: during the flight, with real-time factor and position uncertainty."""
     if not now.simulated_s:
         return f"{now.wall_s:.0f} s"
@@ -116,7 +114,7 @@ def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
     console.print(grid)
 
 
-def print_plan(summary: PlanSummary) -> None:
+def print_plan(summary: "PlanSummary") -> None:
     from twin.planning import summary as plan_summary
     from twin.report.input_rows import input_rows
 

@@ -1,7 +1,5 @@
 """Output paths given by the user: checks before work begins, and conversion of write errors to TwinError."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,7 +32,7 @@ def unused_folder(first: Path) -> Path:
     return new_folder(folder)
 
 
-def run_folder(scenario: Scenario, resume: bool = False) -> Path:
+def run_folder(scenario: "Scenario", resume: bool = False) -> Path:
     """Returns the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty; to resume, the first of all."""
     first = Path("runs") / f"{file_stem(scenario.name)}-{scenario.seed}"
     return first if resume else unused_folder(first)

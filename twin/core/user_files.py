@@ -3,8 +3,6 @@
 Rasters are opened by named drivers of GDAL only, without network and without other files.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -145,7 +143,7 @@ def path_problem(path: Path) -> str | None:
 @contextmanager
 def open_raster(
     file: Path, key: str = "", allowed: str = "", drivers: Sequence[str] = ("GTiff",)
-) -> Iterator[rasterio.DatasetReader]:
+) -> "Iterator[rasterio.DatasetReader]":
     """Opens a raster file by one of the named drivers of GDAL; `key` and `allowed` are those of `reading`.
 
     Raises TwinError if the file is missing, damaged or of another format, names another file, or has larger tiles than
@@ -178,7 +176,7 @@ def _driver(file: Path, drivers: Sequence[str]) -> str:
     raise ValueError(f"it is not a file of the format {', '.join(drivers)}")
 
 
-def _check_contents(source: rasterio.DatasetReader) -> None:
+def _check_contents(source: "rasterio.DatasetReader") -> None:
     if "OVERVIEWS" in source.tag_namespaces():  # GDAL opens the file that OVERVIEW_FILE names, with any driver
         raise ValueError("it names another file, of overviews")
     if max((rows * cols for rows, cols in source.block_shapes), default=0) > max(

@@ -1,7 +1,5 @@
 """Simulated stereo camera: renders the floor and computes light in the water, exposure and noise of each image."""
 
-from __future__ import annotations
-
 import copy
 import functools
 from typing import TYPE_CHECKING, NamedTuple
@@ -57,7 +55,7 @@ class StereoCamera:
 
     def __init__(
         self,
-        renderer: Renderer,
+        renderer: "Renderer",
         image_formation: ImageFormation,
         scenario: Scenario,
         left_rng: np.random.Generator,

@@ -1,7 +1,5 @@
 """A finished survey: its metrics, and its trajectories and maps, which are read from the run folder when needed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -37,7 +35,7 @@ class RunResult:
     folder: Path
 
     @classmethod
-    def of_folder(cls, folder: str | Path) -> RunResult:
+    def of_folder(cls, folder: str | Path) -> "RunResult":
         """Returns the outcome in a run folder; raises TwinError if it is damaged, unfinished or no run folder."""
         from twin.report.run_folder import load_run  # imported here: it needs rasterio
 
@@ -49,7 +47,7 @@ class RunResult:
         return result
 
     @cached_property
-    def contents(self) -> Run:
+    def contents(self) -> "Run":
         from twin.report.run_folder import load_run
 
         return load_run(self.folder)
@@ -60,7 +58,7 @@ class RunResult:
         return self.contents.trajectories
 
     @property
-    def maps(self) -> dict[str, Raster]:
+    def maps(self) -> "dict[str, Raster]":
         """Returns the maps dem, dem_sigma, dem_truth, dem_error [m] and mosaic; row 0 is the northernmost."""
         return self.contents.rasters
 
@@ -71,7 +69,7 @@ class RunResult:
         rows = np.searchsorted(truth.times_s, final.times_s)
         return final.positions - truth.positions[np.minimum(rows, len(truth) - 1)]
 
-    def to_dataframe(self) -> pandas.DataFrame:
+    def to_dataframe(self) -> "pandas.DataFrame":
         """Returns time, true, online, final positions, final error [m] by frame; raises TwinError without pandas."""
         pandas = optional("pandas", "notebook", "to_dataframe")
         table = pandas.DataFrame({"time_s": self.trajectories["final"].times_s})

@@ -1,7 +1,5 @@
 """Writes a run folder: scenario and log during the survey, results after the survey, metrics.json last."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -109,7 +107,7 @@ class RunFolder:
         self._log = reopened(self.path / _LOG, state["_log"])
         self._reserve.write_bytes(bytes(_RESERVE_BYTES))
 
-    def __enter__(self) -> RunFolder:
+    def __enter__(self) -> "RunFolder":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -169,13 +167,13 @@ class RunFolder:
 
     def orthomosaic_file(
         self, grid: MapGrid, georeference: Georeference | None
-    ) -> AbstractContextManager[OrthomosaicFile | None]:
+    ) -> "AbstractContextManager[OrthomosaicFile | None]":
         """Opens mosaic.tif for the tiles of an orthomosaic; the value of the context is None if no maps are written."""
         from twin.exchange.geotiff import OrthomosaicFile
 
         return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
 
-    def tiled_map(self) -> TiledMapFolder:
+    def tiled_map(self) -> "TiledMapFolder":
         from twin.exchange.tiled_map import TiledMapFolder
 
         return TiledMapFolder(self.path / "tiles")
@@ -249,13 +247,13 @@ class RunFolder:
             mesh.write_glb(self.path / "mesh.glb", elevation)
 
 
-def _written_run(folder: Path, metrics: dict[str, Any]) -> Run:
+def _written_run(folder: Path, metrics: dict[str, Any]) -> "Run":
     from twin.report.run_folder import load_run
 
     return load_run(folder, metrics)
 
 
-def _write_optional_output(name: str, run: Run) -> None:
+def _write_optional_output(name: str, run: "Run") -> None:
     if name == "report":
         from twin.report import survey_page
 

@@ -1,7 +1,5 @@
 """Simulated world of a survey: executes commands, returns frames and records the ground truth."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
@@ -69,7 +67,7 @@ class World(ABC):
 
     warnings: tuple[str, ...] = ()
 
-    def __init__(self, mission: Mission, stopwatch: StageTimer, vehicle: AnyVehicle, sensors: NavigationSensors):
+    def __init__(self, mission: Mission, stopwatch: StageTimer, vehicle: "AnyVehicle", sensors: NavigationSensors):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
         scenario = mission.scenario
         duration_s = 2 * mission.n_frames / mission.rig.frame_rate_hz  # also of a survey that is slowed
@@ -243,7 +241,7 @@ class World(ABC):
         )
 
 
-def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:
+def left_camera(vehicle: "AnyVehicle", rig: StereoRig) -> Array:
     """Returns the true world_from_camera (4, 4) of the left camera of a vehicle."""
     return geometry.compose(vehicle.world_from_body, rig.body_from_camera)
 
