@@ -31,7 +31,7 @@ slow: env ## whole surveys and benchmarks
 	$(BIN)/python -m pytest -m slow
 
 bench: env ## the cost of every stage as a ratio to its floor, compared with tests/benchmarks.toml
-	$(BIN)/twin bench --against tests/benchmarks.toml --out runs/bench.png
+	$(BIN)/twin bench --against tests/benchmarks.toml
 
 docs: env ## the documentation as a site, in site/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

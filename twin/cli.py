@@ -583,19 +583,15 @@ def export(
 def bench(
     full: Annotated[bool, option("Also larger images, four scenes and memory.", flag="--full")] = False,
     against: Annotated[Path | None, option("Accepted values (TOML): status 1 if one is exceeded.", "FILE")] = None,
-    out: Annotated[Path | None, option("PNG to write, with a bar for each ratio.")] = None,
     as_json: Annotated[bool, option("Print only the rows, as JSON.", flag="--json")] = False,
 ) -> None:
     """Measure the cost of each stage as a ratio to that of the best library call or limit, side by side."""
     from twin.bench import report as benchmark
 
-    accepted, file = against and benchmark.read_accepted(against), out and outputs.output_file(out)
+    accepted = against and benchmark.read_accepted(against)
     with console.replay_bar() as progress:
         rows = benchmark.measure(full, progress)
     problems = accepted.problems(rows) if accepted else []
-    if file is not None:
-        with outputs.writing(file):
-            benchmark.draw(rows, file)
     _show(as_json, benchmark.as_json(rows, problems), [("Benchmark", benchmark.table(rows))], "\n".join(problems))
     raise typer.Exit(1 if problems else 0)
 

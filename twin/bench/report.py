@@ -1,4 +1,4 @@
-"""The benchmark: all rows, their accepted values, and their picture."""
+"""The benchmark: all rows and their accepted values."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -6,7 +6,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-import matplotlib
 import numpy as np
 from pydantic import Field
 
@@ -15,8 +14,6 @@ from twin.bench.plain_renderer import PlainRenderer
 from twin.bench.stages import SMALL, stage_rows
 from twin.bench.surveys import surrogate_rows, survey_rows
 from twin.core.timing import Stopwatch
-from twin.report.plotting import log_axis, one_panel
-from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.scenario.file import load_scenario, read_toml, validated
 from twin.scenario.model import Section, Source
 from twin.session.assembly import open_world
@@ -29,11 +26,6 @@ _START = {
     "import": (("-c", "import twin.survey"), ("-c", _LIBRARIES), "import of its libraries"),
     "twin --help": (("-m", "twin", "--help"), ("-c", "import typer, rich.console"), "import of typer and rich"),
 }
-_PLAIN_PAPER = """
-from twin.bench.report import PlainRenderer, load_scenario, prepare
-mission = prepare(load_scenario("paper"))
-PlainRenderer(mission.terrain, mission.rig).render(mission.start)
-"""
 
 
 class AcceptedValue(Section):
@@ -109,21 +101,7 @@ def _memory_row(size: str) -> BenchmarkRow:
     with TemporaryDirectory(prefix="twin-") as folder:
         keys = [*SMALL, *_SIZES[size]]
         ours_mb = child_peak_mb(f"import twin; twin.run('paper', '{folder}/run', {keys})")
-    plain_mb = child_peak_mb(_PLAIN_PAPER)
-    return BenchmarkRow(f"memory of paper {size}", "MB", [ours_mb], "mujoco.Renderer of its floor", [plain_mb])
-
-
-def draw(rows: Sequence[BenchmarkRow], file: Path) -> None:
-    """Writes a picture with a bar for each ratio, and its least and greatest value."""
-    shown = [row for row in rows if len(row.floors)][::-1]
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure, axes = one_panel(1 + 0.25 * len(shown))
-        median, low, high = np.array([row.spread for row in shown]).T
-        labels = [f"{row.name} / {row.floor}" for row in shown]
-        axes.barh(labels, median, 0.6, xerr=[median - low, high - median], color=COLOURS["online"])
-        axes.set_xlabel("ratio to the floor")
-        log_axis(axes.xaxis)
-        figure.savefig(file)
+    return BenchmarkRow(f"memory of paper {size}", "MB", [ours_mb])
 
 
 def table(rows: Sequence[BenchmarkRow]) -> list[tuple[str, ...]]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.series import GrowingArray
+from twin.estimate.adjustment.pose_graph import retract
 from twin.kernels import kernel
 
 _LEAST_VARIANCE = 1e-12  # of a component of a step [rad^2, m^2]
@@ -40,7 +41,7 @@ class PoseLog:
         The steps in between were predicted. The last one is taken to be like them.
         """
         self.append(time_s, f2f, online, self.steps.array[-1].copy(), self.variances.array[-1].copy())
-        motions = _motions(self.steps.array[first:])
+        motions = retract(np.tile(np.eye(4), (len(self) - first, 1, 1)), self.steps.array[first:])
         _close(motion, motions, np.maximum(self.variances.array[first:], _LEAST_VARIANCE))
         self.steps.array[first:] = np.array([geometry.log(one) for one in motions]).reshape(-1, 6)
 
@@ -61,20 +62,12 @@ def interpolate_between_keyframes(
     squares, weighted by their variances: a step that failed takes nearly all of it. Frames before the first and after
     the last keyframe follow the steps without correction. `steps` and `variances` are those of `PoseLog`; m > 0.
     """
-    motions, variances = _motions(steps), np.maximum(variances, _LEAST_VARIANCE)
+    motions, variances = retract(np.tile(np.eye(4), (len(steps), 1, 1)), steps), np.maximum(variances, _LEAST_VARIANCE)
     between = zip(rows, rows[1:], keyframe_poses, keyframe_poses[1:], strict=False)
     for row, next_row, pose, next_pose in between:
         inner = slice(row + 1, next_row + 1)
         _close(geometry.inverse(pose) @ next_pose, motions[inner], variances[inner])
     return _follow(motions, rows, keyframe_poses)
-
-
-@kernel
-def _motions(twists):
-    motions = np.empty((len(twists), 4, 4))
-    for k in range(len(twists)):
-        geometry.copy_into(motions[k], geometry.exp(twists[k]))
-    return motions
 
 
 @kernel

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import trimesh
 
 from twin.core import geometry
 from twin.core.records import Array, Image
+from twin.exchange.mesh import GLB_FROM_WORLD
 from twin.imaging.scene.mesh_raster import NEAR_M, DrawnMesh, Projection, Target, draw_meshes
 from twin.terrains.objects.coloured_mesh import with_colours
 
@@ -31,8 +33,6 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
         map_from_world: (4, 4) pose of the world in the map, whose axes are east, north and up of the picture; None: the
             identity.
     """
-    import trimesh
-
     if not mesh_file.is_file():
         return None
     try:
@@ -59,10 +59,6 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
 
 def in_map_frame(vertices: Array, map_from_world: Array) -> Array:
     """Returns vertices (n, 3) of a mesh in the world in the frame of its map, both in the axes of glTF [m]."""
-    if np.array_equal(map_from_world, np.eye(4)):
-        return vertices
-    from twin.exchange.mesh import GLB_FROM_WORLD  # imports trimesh
-
     return geometry.transform(map_from_world, vertices @ GLB_FROM_WORLD) @ GLB_FROM_WORLD.T
 
 

@@ -153,7 +153,7 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
     while True:
         equations = _linearise(graph, current, matrix)
         step = _solve(matrix, equations, damping)
-        trial = GraphState(_retract(current.state.poses, step.poses), current.state.shared + step.shared)
+        trial = GraphState(retract(current.state.poses, step.poses), current.state.shared + step.shared)
         expected = -0.5 * (np.sum(equations.gradient * step.poses) + equations.shared_gradient @ step.shared)
         after, max_iterations = _evaluate(graph, trial), max_iterations - 1
         if after.cost <= current.cost + _COST_TOLERANCE:
@@ -363,7 +363,8 @@ def pose_residual_jacobians(residuals):
 
 
 @kernel
-def _retract(poses, increments):
+def retract(poses, increments):
+    """Returns poses (n, 4, 4) moved by increments (n, 6) in their own axes."""
     moved = np.empty_like(poses)
     for k in range(len(poses)):
         geometry.copy_into(moved[k], geometry.compose(poses[k], geometry.exp(increments[k])))
