@@ -1,7 +1,9 @@
 """MuJoCo, which is imported from here only, when it is first used. Surveys need none of its OpenGL."""
 
 import os
+from ctypes import c_void_p
 from functools import cache
+from importlib import import_module
 from typing import Any, TypeAlias
 
 
@@ -13,6 +15,14 @@ def _loaded() -> Any:
         os.environ["MUJOCO_GL"] = "disabled"
         import mujoco
     return mujoco
+
+
+def draw_with_egl() -> None:
+    """Makes `mujoco.Renderer` use EGL. PyOpenGL 3.1.0 lacks EGLDeviceEXT, an opaque pointer."""
+    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    egl: Any = import_module("OpenGL.EGL")
+    egl.EGLDeviceEXT = getattr(egl, "EGLDeviceEXT", c_void_p)
+    import_module("mujoco.rendering.classic.gl_context").GLContext = import_module("mujoco.egl").GLContext
 
 
 class _MuJoCo:

@@ -48,7 +48,7 @@ def twin_command(monkeypatch, tmp_path, capsys):
     def command(*words, outcome=None):
         surveys = []
         fake = types.ModuleType("twin.survey")
-        fake.run = lambda *arguments: surveys.append(arguments) or outcome
+        fake.run = lambda *arguments, **_: surveys.append(arguments) or outcome
         monkeypatch.setitem(sys.modules, "twin.survey", fake)
         monkeypatch.setattr(twin, "survey", fake, raising=False)
         monkeypatch.setattr(sys, "argv", ["twin", *words])

@@ -103,8 +103,8 @@ def away(first):
     return along(first, [9.0, 9.3, 9.6], 0.0)
 
 
-def chosen_of(earlier, node, most):
-    settings = EstimatorSettings(min_overlap=0.45, max_links=most, patch_px=PATCH_PX)
+def chosen_of(earlier, node, most, stride=1):
+    settings = EstimatorSettings(min_overlap=0.45, max_links=most, patch_px=PATCH_PX, node_stride=stride)
     links = link_selection.choose_links(node, earlier, poses_of(earlier), RIG, settings)
     return [k.number for k, _ in links]
 
@@ -406,7 +406,7 @@ def test_links_to_another_swath_are_spread_along_it(stride):
     earlier, node = along(0, [0.1], 0.8) + second + away(10), over_flat_floor(13, 0.02, 0.0)
     for key in [*earlier, node]:
         key.number *= stride
-    assert chosen_of(earlier, node, 4) == [stride * k for k in [0, 5, 7, 3]]
+    assert chosen_of(earlier, node, 4, stride) == [stride * k for k in [0, 5, 7, 3]]
     assert chosen_of(earlier, node, 8) == [stride * k for k in [0, 5, 7, 3, 9, 1, 6, 4]]  # neighbours at last
 
 

@@ -72,8 +72,8 @@ STAGES = {
     "orthomosaic": (twin.session.flown_survey, "make_orthomosaic"),
     "evaluation": (twin.session.conclusion, "evaluate"),
     "maps": (mesh, "write_glb"),
-    "report": (survey_page, "write_report"),
-    "recording": (recording, "write_recording"),
+    "report": (survey_page, "write_page"),
+    "recording": (recording, "record_run"),
 }
 
 
@@ -95,7 +95,7 @@ def test_an_interrupt_ends_only_the_current_stage(tmp_path, monkeypatch, stage):
     owner, name = STAGES[stage]
     for number, (other, written) in {"report": STAGES["report"], "recording": STAGES["recording"]}.items():
         if number != stage:
-            monkeypatch.setattr(other, written, lambda folder, _, number=number: (folder / number).touch())
+            monkeypatch.setattr(other, written, lambda run, number=number: (run.folder / number).touch())
     monkeypatch.setattr(owner, name, in_first_call(getattr(owner, name), signal.SIGINT))
     result = fly(tmp_path / "run", ("report", "recording"))
     metrics = checked(tmp_path / "run")

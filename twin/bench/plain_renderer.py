@@ -8,7 +8,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.height_field import grid_triangles
 from twin.core.records import Image, StereoRig
-from twin.scenes.gl import mujoco
+from twin.scenes.gl import draw_with_egl, mujoco
 from twin.terrains import Terrain
 
 _TO_MUJOCO_AXES = np.diag([1.0, -1.0, -1.0])  # MuJoCo's cameras have y up and look along -z
@@ -41,6 +41,7 @@ class PlainRenderer(AbstractContextManager["PlainRenderer"]):
         camera.add_camera(name="camera", fovy=float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px))))
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
+        draw_with_egl()
         self._renderer = mujoco.Renderer(self._model, rig.height_px, rig.width_px)
 
     def __exit__(self, *_: object) -> None:

@@ -37,7 +37,7 @@ def render_path(scenario: Scenario, poses: Path, out: Path, progress: Callable[[
         _check_clearance(path, mission)
         twists = _twists(path.world_from_camera, mission.rig.body_from_camera, mission.rig.frame_rate_hz)
         numbers = list(range(len(path)))
-        with RunFolder(out, scenario, None) as folder, RenderedWorld(mission, Stopwatch()) as world:
+        with RunFolder(out, scenario, ()) as folder, RenderedWorld(mission, Stopwatch()) as world:
             (folder.path / "keyframes").mkdir(exist_ok=True)
             index = {"frames": numbers, "tracks": [1] * len(numbers)}
             (folder.path / "keyframes" / "index.json").write_text(json.dumps(index), encoding="utf-8")

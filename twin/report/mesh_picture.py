@@ -46,14 +46,16 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
     height, width = _FINER * HEIGHT_PX, _FINER * WIDTH_PX
     focal_px = height / 2 / np.tan(np.deg2rad(VFOV_DEG) / 2)
     view = Projection(float(focal_px), (width - 1) / 2, (height - 1) / 2, NEAR_M, True)
-    target = Target(np.full((height, width), np.inf, np.float32), np.full((height, width, 3), 255, np.uint8))
+    drawn, depth = np.full((height, width, 3), 255, np.uint8), np.full((height, width), np.inf, np.float32)
     camera_from_mesh = np.diag([1.0, -1.0, -1.0, 1.0]) @ geometry.inverse(camera_pose(mesh.vertices))
-    draw_meshes([DrawnMesh(with_colours(mesh.vertices, mesh.faces, colours), camera_from_mesh)], view, target)
-    rows, cols = np.nonzero(np.isfinite(target.depth))
+    draw_meshes(
+        [DrawnMesh(with_colours(mesh.vertices, mesh.faces, colours), camera_from_mesh)], view, Target(depth, drawn)
+    )
+    rows, cols = np.nonzero(np.isfinite(depth))
     if not len(rows):
         return None
     shown = np.s_[rows.min() // _FINER : rows.max() // _FINER + 1, cols.min() // _FINER : cols.max() // _FINER + 1]
-    picture = cv2.resize(target.albedo, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
+    picture = cv2.resize(drawn, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(picture[shown])
 
 
