@@ -15,7 +15,6 @@ from twin.core import geometry
 from twin.errors import ScenarioError, TwinError
 from twin.imaging.scene.renderer import Renderer
 from twin.scenario.file import load_scenario
-from twin.scenes.builder import build
 from twin.world.mission import load_terrain
 
 ACCEPTED = Path(__file__).parent / "benchmarks.toml"
@@ -30,11 +29,9 @@ def test_the_plain_renderer_shows_the_albedo_of_the_renderer_of_surveys():
     scenario = load_scenario("reef", ["terrain.size_m=[4.0,3.2]", 'rig.model="ideal"'])
     terrain, rig = load_terrain(scenario), scenario.believed_rig()
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, -0.2, 1.6]))
-    vfov_deg = float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px)))
     with PlainRenderer(terrain, rig) as plain:
         shown = plain.render(pose).astype(int)
-    with Renderer(build(terrain, 0.01), rig.width_px, rig.height_px, vfov_deg) as renderer:
-        albedo, _ = renderer.render(pose)
+    albedo, _ = Renderer(terrain, rig.width_px, rig.height_px, rig.focal_px).render(pose)
     assert np.abs(shown - albedo).mean() < 0.1 < albedo.std()
 
 

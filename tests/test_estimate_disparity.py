@@ -14,7 +14,7 @@ INSIDE = np.s_[10:-10, 60:-10]
 def on_slanted_plane(noise):
     rng = np.random.default_rng(1)
     left, right, depth = stereo_pair(plane(0.4, 0.3), RIG, down_camera(0, 0, 2.0, (0.03, -0.02, 0.3)), rng, noise)
-    result = disparity.dense_disparity(left, right)
+    result = disparity.match_densely(left, right).fine
     return result, RIG.focal_px * RIG.baseline_m / depth
 
 
@@ -59,7 +59,7 @@ def test_sigma_agrees_with_the_error_for_spatially_correlated_noise():
     views = [
         np.clip(view + n, 0, 255).astype(np.uint8) for view, n in zip((clear_left, clear_right), noise, strict=True)
     ]
-    result = disparity.dense_disparity(*views)
+    result = disparity.match_densely(*views).fine
     z = ((result.disparity_px - RIG.focal_px * RIG.baseline_m / depth) / result.sigma_px)[INSIDE]
     assert 0.7 < np.nanpercentile(np.abs(z), 68.3) < 1.3
 
@@ -67,7 +67,7 @@ def test_sigma_agrees_with_the_error_for_spatially_correlated_noise():
 def test_the_margin_that_is_visible_in_the_left_image_only_has_no_disparity():
     rng = np.random.default_rng(2)
     left, right, depth = stereo_pair(plane(), RIG, down_camera(0, 0, 1.5), rng)
-    result = disparity.dense_disparity(left, right)
+    result = disparity.match_densely(left, right).fine
     margin = int(RIG.focal_px * RIG.baseline_m / depth[0, 0]) - 2
     assert np.isnan(result.disparity_px[:, :margin]).mean() > 0.98
 
@@ -91,7 +91,7 @@ def test_half_occluded_pixels_next_to_a_block_have_no_wrong_disparity():
     columns, rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in truth.shape[::-1]))
     there = cv2.remap(RIG.focal_px * RIG.baseline_m / right_depth, columns - truth, rows, cv2.INTER_NEAREST)
     hidden = (np.abs(there - truth) > 1)[:, 40:]
-    result = disparity.dense_disparity(left, right)
+    result = disparity.match_densely(left, right).fine
     assert hidden.sum() > 500
     error = np.abs(result.disparity_px - truth)[:, 40:]
     assert (error[hidden] > 1).mean() < 0.06  # without left-right check: 0.09
@@ -120,7 +120,7 @@ def test_on_the_motorcycle_pair_disparity_is_dense_and_sigma_predicts_mismatches
         cv2.imread(str(outside_data(f"motorcycle_{side}.png")), cv2.IMREAD_GRAYSCALE) for side in ("left", "right")
     )
     truth = np.load(outside_data("motorcycle_disp.npz"))["arr_0"]
-    result = disparity.dense_disparity(left, right)
+    result = disparity.match_densely(left, right).fine
     error = np.abs(result.disparity_px - truth)
     known = np.isfinite(error)
     assert known.sum() / np.isfinite(truth).sum() >= 0.84
@@ -138,7 +138,7 @@ def test_illumination_and_backscatter_that_differ_between_the_images_cause_no_bi
     u = np.linspace(0, 1, RIG.width_px)
     lit = [image * (0.4 + 0.6 * np.exp(-((u - at) ** 2) / 0.2)) * 0.5 + 40 + 40 * at * u for image, at in
            ((left, 0.4), (right, 0.6))]  # fmt: skip
-    result = disparity.dense_disparity(*(digitise(image, rng, 2.0) for image in lit))
+    result = disparity.match_densely(*(digitise(image, rng, 2.0) for image in lit)).fine
     error = (result.disparity_px - RIG.focal_px * RIG.baseline_m / depth)[INSIDE]
     assert abs(np.nanmedian(error)) < 0.02
     assert np.nanpercentile(np.abs(error), 90) < 0.3
@@ -147,7 +147,7 @@ def test_illumination_and_backscatter_that_differ_between_the_images_cause_no_bi
 def test_images_without_texture_have_almost_no_disparity():
     rng = np.random.default_rng(4)
     gray = [digitise(np.full((240, 320), 100.0), rng, 2.0) for _ in range(2)]
-    assert np.isfinite(disparity.dense_disparity(*gray).disparity_px).mean() < 0.1
+    assert np.isfinite(disparity.match_densely(*gray).fine.disparity_px).mean() < 0.1
 
 
 def test_the_search_range_contains_all_disparities_of_a_scene_and_is_the_widest_without_a_match():

@@ -40,7 +40,7 @@ def test_noise_of_interpolated_pixels_does_not_bias_disparities_of_faint_texture
     rng, errors = np.random.default_rng(1), []
     for x_m in np.arange(12) * 0.7:
         pair, truth = faint_pair(x_m, RIG.focal_px * RIG.baseline_m / (4 + fraction), rng)
-        errors.append(disparity.dense_disparity(*pair).disparity_px[INSIDE] - truth)
+        errors.append(disparity.match_densely(*pair).fine.disparity_px[INSIDE] - truth)
     assert abs(np.nanmedian(errors)) < 0.03
 
 
@@ -53,7 +53,7 @@ def test_the_light_of_lamps_is_not_matched_as_texture_once_it_is_known():
     pattern = light_pattern(coefficients, (60, 80))
 
     def gross(left, right):
-        found = [disparity.dense_disparity(p[0] - left, p[1] - right) for p, _ in surveyed]
+        found = [disparity.match_densely(p[0] - left, p[1] - right).fine for p, _ in surveyed]
         error = np.abs(np.array([f.with_sigma_below(0.5).disparity_px for f in found]) - truth)
         return np.mean(error[np.isfinite(error)] > 1), np.isfinite(error).mean()
 
@@ -73,7 +73,7 @@ def test_the_map_of_a_faintly_textured_floor_is_right_without_the_light_pattern(
     pattern = light_pattern(pattern_coefficients(fits), (60, 80))
     grid = MapGrid(-1.0, 2.0, 0.1, 30, 52)
     median, median_before = (
-        np.nanmedian(np.abs(build_map(pairs, path, RIG, grid, pattern=p).height_m)) for p in (pattern, None)
+        np.nanmedian(np.abs(build_map(pairs, path, RIG, grid, pattern=p).height_m)) for p in (pattern, 0 * pattern)
     )
     assert median < 0.08  # 0.2 px of disparity
     assert median < 0.5 * median_before

@@ -33,7 +33,7 @@ def hide_log_failures() -> None:
     """Hides the traceback that rasterio prints if GDAL's message quotes bytes of a damaged file that are not UTF-8."""
     default = sys.unraisablehook
 
-    def hook(failure: sys.UnraisableHookArgs) -> None:
+    def hook(failure: "sys.UnraisableHookArgs") -> None:
         if failure.object != "rasterio._env.log_error":
             default(failure)
 

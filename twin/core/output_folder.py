@@ -1,9 +1,9 @@
 """Output folders: one process at a time writes a folder, and results are not mixed with what it already contains."""
 
 import errno
-import fcntl
 import os
 import platform
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +15,7 @@ from twin.errors import TwinError
 LOCK_FILE = ".lock"  #: is in a folder while this is written, and names the process
 _HELD = (errno.EACCES, errno.EAGAIN, errno.EDEADLK)  # of an attempt to lock what another process has locked
 _FREE = "another folder, or without its file .lock if that process has ended"
+_LOCKED_BYTE = 1 << 20  # on Windows, which lets no other process read a locked byte
 NEW_FOLDER = "a new or an empty folder"
 
 
@@ -91,7 +92,18 @@ def _locked(folder: Path, option: str) -> int:
 def _lock(lock: int) -> bool:
     """Returns whether the lock of a file was free and now belongs to this descriptor."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if sys.platform == "win32":
+            import msvcrt
+
+            os.lseek(lock, _LOCKED_BYTE, os.SEEK_SET)
+            try:
+                msvcrt.locking(lock, msvcrt.LK_NBLCK, 1)
+            finally:
+                os.lseek(lock, 0, os.SEEK_SET)
+        else:
+            import fcntl
+
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         # a file system without locks: whoever finds no name in the file writes its own
         return error.errno not in _HELD and os.fstat(lock).st_size == 0
@@ -100,6 +112,9 @@ def _lock(lock: int) -> bool:
 
 
 def _release(lock: int, file: Path) -> None:
-    with suppress(OSError):  # before another process may lock it
+    with suppress(OSError):  # Windows removes no open file; elsewhere no other process may lock it before it is removed
         file.unlink()
     os.close(lock)
+    with suppress(OSError):
+        if sys.platform == "win32":
+            file.unlink()

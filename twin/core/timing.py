@@ -1,6 +1,5 @@
 """Stopwatch for the processing stages of a survey."""
 
-import resource
 import sys
 import time
 from collections import defaultdict
@@ -39,12 +38,16 @@ class Stopwatch:
 
 
 def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
-    """Returns wall and simulated or recorded time [s], peak memory [MiB], and times of the stages."""
+    """Returns wall and simulated or recorded time [s], peak memory [MiB] (None on Windows), and times of the stages."""
     memory_mb = _peak_rss_mb()
     return {"wall_s": wall_s, "simulated_s": simulated_s, "peak_rss_mb": memory_mb, "stages": stopwatch.summary()}
 
 
-def _peak_rss_mb() -> float:
+def _peak_rss_mb() -> float | None:
+    if sys.platform == "win32":
+        return None
+    import resource
+
     unit = 2**20 if sys.platform == "darwin" else 2**10  # of ru_maxrss
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 

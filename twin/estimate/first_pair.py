@@ -139,6 +139,6 @@ def inspect_light(pair: PairInspection, frames: Iterable[Frame], rig: StereoRig)
     coefficients, dense = pattern_coefficients(fits), pair.disparity
     if coefficients is not None:
         levels = np.array([matching.luma(image) for image in (pair.left, pair.right)])
-        dense = disparity.dense_disparity(*(levels - light_pattern(coefficients, levels.shape[1:])))
+        dense = disparity.match_densely(*(levels - light_pattern(coefficients, levels.shape[1:]))).fine
     even = np.clip(np.round(pair.left * illumination.gain()), 0, 255).astype(np.uint8)
     return LightInspection(len(fits), mean[0] / len(fits), mean[1] / len(fits), even, coefficients is not None, dense)

@@ -56,7 +56,7 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
         return None
     shown = np.s_[rows.min() // _FINER : rows.max() // _FINER + 1, cols.min() // _FINER : cols.max() // _FINER + 1]
     picture = cv2.resize(drawn, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(picture[shown])
+    return np.asarray(picture[shown], np.uint8)
 
 
 def in_map_frame(vertices: Array, map_from_world: Array) -> Array:
@@ -79,7 +79,8 @@ def camera_pose(vertices: Array) -> Array:
     """
     low, high = np.percentile(vertices, FRAMED_PERCENT, axis=0)
     framed = np.clip(vertices, low, high)
-    rotation = _axis_rotation(1, EAST_DEG) @ _axis_rotation(0, -DEPRESSION_DEG)
+    about_up, about_right = np.deg2rad([[0.0, EAST_DEG, 0.0], [-DEPRESSION_DEG, 0.0, 0.0]])
+    rotation = geometry.so3_exp(about_up) @ geometry.so3_exp(about_right)
     centre = (low + high) / 2
     tangents = np.tan(np.deg2rad(VFOV_DEG) / 2) * np.array([WIDTH_PX / HEIGHT_PX, 1.0])
     points = (framed - centre) @ rotation
@@ -87,7 +88,3 @@ def camera_pose(vertices: Array) -> Array:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, centre + distance * rotation[:, 2]
     return pose
-
-
-def _axis_rotation(axis: int, angle_deg: float) -> Array:
-    return np.asarray(cv2.Rodrigues(np.deg2rad(angle_deg) * np.eye(3)[axis])[0])

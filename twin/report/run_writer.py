@@ -147,7 +147,9 @@ class RunFolder:
                 self._write_trajectories(record)
                 kept = ("mosaic.tif",) if record.has_orthomosaic else ()
                 self._attempt(guard, "maps", lambda: self._write_maps(record), kept)
-                written = cache(lambda: _written_run(self.path, metrics))  # read once for both outputs
+                from twin.report.run_folder import load_run
+
+                written = cache(lambda: load_run(self.path, metrics))  # read once for both outputs
                 for name in OPTIONAL_OUTPUTS:
                     if name in self._outputs:
                         self._attempt(guard, name, lambda name=name: _write_optional_output(name, written()))
@@ -245,12 +247,6 @@ class RunFolder:
         if elevation is not None:
             geotiff.write_map(self.path, elevation, origin, mosaic=not record.has_orthomosaic)
             mesh.write_glb(self.path / "mesh.glb", elevation)
-
-
-def _written_run(folder: Path, metrics: dict[str, Any]) -> "Run":
-    from twin.report.run_folder import load_run
-
-    return load_run(folder, metrics)
 
 
 def _write_optional_output(name: str, run: "Run") -> None:

@@ -66,9 +66,6 @@ class SurrogateWorld(World):
         floor = self.vehicle.state.floor if isinstance(self.vehicle, CompiledVehicle) else self._obstacles
         return (*super().made_anew, floor, self.vision.floor, self.vision.matchability)
 
-    def close(self) -> None:
-        pass
-
     def capture(self, step: Step) -> CameraImages:
         pose, rig = self.world_from_camera, self.mission.rig
         return CameraImages(

@@ -73,9 +73,6 @@ class RenderedWorld(World):
         floor, objects = self.mission.terrain, self.mission.objects
         return with_objects(floor, objects) if objects else floor
 
-    def close(self) -> None:
-        """Has no effect: the world holds no resources."""
-
     def capture(self, step: Step) -> CameraImages:
         if self.faults.exist:
             self._image_formation.light_lamps(self.faults.lamps_lit(len(self.mission.scenario.lamps)).tolist())

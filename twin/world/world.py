@@ -99,9 +99,8 @@ class World(ABC):
         floors = (one and one.floor for one in (self._altimeter, self._bottom_lock))
         return (self.mission, *vars(self.mission).values(), *floors)
 
-    @abstractmethod
     def close(self) -> None:
-        """Releases the resources of the world."""
+        """Releases the resources of the world; by default, it has none."""
 
     @abstractmethod
     def capture(self, step: Step) -> CameraImages:

@@ -29,6 +29,7 @@ MAX_RELATIVE_SIGMA = 0.2
 
 
 ImagePair = tuple[Image, Image]  # left and right image (H, W, 3)
+_NO_PATTERN = np.zeros((2, 1, 1), np.float32)
 #: Left image (H, W, 3), and the right one or the disparity between them without the light pattern, if it is known.
 MapView = tuple[Image, Image | Disparity]
 
@@ -55,7 +56,7 @@ def build_map(
     rig: StereoRig,
     grid: MapGrid,
     progress: Callable[[int], None] = lambda _: None,
-    pattern: Map | None = None,
+    pattern: Map = _NO_PATTERN,
     calibration: CalibrationEstimate = EXACT,
 ) -> ElevationMap:
     """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far.
@@ -101,15 +102,11 @@ def with_calibration_sigma(
     return replace(found, sigma_m=np.sqrt(found.sigma_m**2 + variance).astype(found.sigma_m.dtype))
 
 
-def _measure_depth(view: MapView, yaw_rad: float, rig: StereoRig, pattern: Map | None) -> tuple[Image, Map, DepthMap]:
+def _measure_depth(view: MapView, yaw_rad: float, rig: StereoRig, pattern: Map) -> tuple[Image, Map, DepthMap]:
     """Returns the left image, its grey levels without the light pattern, and its depth from this pair alone."""
     image, other = view
-    left = luma(image) if pattern is None else luma(image) - pattern[0]
-    if isinstance(other, Disparity):
-        stereo = other
-    else:
-        right = luma(other)
-        stereo = disparity.dense_disparity(left, right if pattern is None else right - pattern[1])
+    left = luma(image) - pattern[0]
+    stereo = other if isinstance(other, Disparity) else disparity.match_densely(left, luma(other) - pattern[1]).fine
     stereo = stereo.with_sigma_below(np.minimum(MAX_STEREO_SIGMA_PX, MAX_RELATIVE_SIGMA * stereo.disparity_px))
     if rig.port is not None:
         stereo = stereo._replace(disparity_px=_without_refraction(stereo.disparity_px, rig))

@@ -81,11 +81,6 @@ def match_densely(left: Image | Map, right: Image | Map) -> DenseMatch:
     return DenseMatch(coarse, Disparity(fine.disparity_px, sigma).with_sigma_below(limit_px))
 
 
-def dense_disparity(left: Image | Map, right: Image | Map) -> Disparity:
-    """Returns the refined disparity of `match_densely`."""
-    return match_densely(left, right).fine
-
-
 def search_range(left: Image, right: Image) -> tuple[int, int]:
     """Returns the smallest and the largest disparity to search in images (H, W) of normalised contrast [px].
 

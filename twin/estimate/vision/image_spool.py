@@ -17,6 +17,7 @@ from twin.core.records import Image
 from twin.estimate.vision import matching
 from twin.estimate.vision.disparity import Disparity
 
+_Grays = tuple[matching.Gray, matching.Gray]  # of the left and the right image
 _CACHE_BYTES = 384 * 2**20
 
 
@@ -53,14 +54,7 @@ class ImageSpool:
             check_hash(file, expected)
         self._start()
 
-    def put(
-        self,
-        row: int,
-        left: Image,
-        right: Image,
-        gray: tuple[matching.Gray, matching.Gray],
-        disparity: Disparity | None = None,
-    ) -> None:
+    def put(self, row: int, left: Image, right: Image, gray: _Grays, disparity: Disparity | None = None) -> None:
         """Stores the full stereo pair of a keyframe, which another thread writes; binned grey levels and disparity."""
         self.flush()
         self._writing = self._writer.submit(self._write, row, left, right, disparity)
@@ -95,7 +89,7 @@ class ImageSpool:
         self.flush()
         return Disparity.unpacked(np.load(self._path(row, "disparity", ".npy")))
 
-    def gray(self, row: int) -> tuple[matching.Gray, matching.Gray]:
+    def gray(self, row: int) -> _Grays:
         """Returns the binned grey levels of both images of the keyframe at frame index `row`, in half precision."""
         with self._lock:
             if row not in self._gray:
@@ -105,7 +99,7 @@ class ImageSpool:
             left, right = self._gray[row]
         return left.astype(np.float32), right.astype(np.float32)
 
-    def _cache(self, row: int, pair: tuple[matching.Gray, matching.Gray]) -> None:
+    def _cache(self, row: int, pair: _Grays) -> None:
         self._gray[row] = pair[0].astype(np.float16), pair[1].astype(np.float16)
         while len(self._gray) > 1 and len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)
