@@ -91,7 +91,7 @@ def _opening_row(scene: str) -> BenchmarkRow:
     scenario = load_scenario(scene)
     mission = prepare(scenario)
     ours, floor = alternate(
-        lambda: open_world(prepare(scenario), Stopwatch()).close(),
+        lambda: open_world(prepare(scenario), Stopwatch()),
         lambda: PlainRenderer(mission.terrain, mission.rig).__exit__(),
     )
     return BenchmarkRow(f"opening {scene}", "ms", ours, "mujoco.Renderer of its floor", floor)

@@ -91,16 +91,13 @@ class World(ABC):
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        """Has no effect: a world holds no resources."""
 
     @property
     def made_anew(self) -> tuple[object, ...]:
         """Returns objects that follow from the mission alone, in one order: a checkpoint of the world lacks them."""
         floors = (one and one.floor for one in (self._altimeter, self._bottom_lock))
         return (self.mission, *vars(self.mission).values(), *floors)
-
-    def close(self) -> None:
-        """Releases the resources of the world; by default, it has none."""
 
     @abstractmethod
     def capture(self, step: Step) -> CameraImages:
