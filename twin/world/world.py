@@ -91,7 +91,7 @@ class World(ABC):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Has no effect: a world holds no resources."""
+        return  # a world holds no resources
 
     @property
     def made_anew(self) -> tuple[object, ...]:
