@@ -32,7 +32,7 @@ def test_the_plain_renderer_shows_the_albedo_of_the_renderer_of_surveys():
     with PlainRenderer(terrain, rig) as plain:
         shown = plain.render(pose).astype(int)
     albedo, _ = Renderer(terrain, rig.width_px, rig.height_px, rig.focal_px).render(pose)
-    assert np.abs(shown - albedo).mean() < 0.1 < albedo.std()
+    assert np.abs(shown - albedo).mean() < 0.5 < albedo.std()
 
 
 def test_a_row_compares_round_by_round():

@@ -407,7 +407,7 @@ def test_links_to_another_swath_are_spread_along_it(stride):
     for key in [*earlier, node]:
         key.number *= stride
     assert chosen_of(earlier, node, 4, stride) == [stride * k for k in [0, 5, 7, 3]]
-    assert chosen_of(earlier, node, 8) == [stride * k for k in [0, 5, 7, 3, 9, 1, 6, 4]]  # neighbours at last
+    assert chosen_of(earlier, node, 8, stride) == [stride * k for k in [0, 5, 7, 3, 9, 1, 6, 4]]  # neighbours at last
 
 
 def test_links_of_one_node_together_have_the_information_of_one_link():
