@@ -24,8 +24,7 @@ _CACHE_BYTES = 384 * 2**20
 class ImageSpool:
     """Stores stereo pairs on disk as lossless PNG, with a cache of limited size of the last grey levels used.
 
-    Their disparities are kept until `close`. `gray` may be called by several threads. Methods but `close` raise OSError
-    if files could not be read or written.
+    `gray` may be called by several threads. Methods but `close` raise OSError if files could not be read or written.
 
     Args:
         folder: folder of the images; created if missing.
@@ -70,8 +69,6 @@ class ImageSpool:
     def close(self) -> None:
         """Waits until all pairs are written, and ends the thread; an error of the last pair is not raised."""
         self._writer.shutdown()
-        for file in self.folder.glob("*_disparity.npy"):
-            file.unlink(missing_ok=True)
 
     def pair(self, row: int) -> tuple[Image, Image]:
         """Returns the left and the right image (H, W, 3) of the keyframe at frame index `row`."""
