@@ -33,7 +33,6 @@ class _Coefficients(NamedTuple):
 
 _RENDERED_S = _Coefficients(start=9.7, frame=0.0087, frame_mpx=0.221, keyframe=0.07, keyframe_mpx=3.0)
 _OBJECTS_S = _Coefficients(start=4.0, frame=0.022)  # in addition, with objects in the images
-_WALLS_S = _Coefficients(start=0.0, frame=0.03)  # in addition, over a floor with walls
 _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
 _RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=4.2)
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
@@ -55,7 +54,6 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
     window = round(n_keyframes * min(1.0, (window_tracks + 1) / len(mission.tracks)))
     memory_mb = _RENDERED_MB.total(mission.n_frames, window, megapixels) + _IMAGES_MB_PER_MPX * megapixels
     time_s = _RENDERED_S.total(*size) + (_OBJECTS_S.total(*size) if mission.objects else 0.0)
-    time_s += 0.0 if mission.terrain.walls is None else _WALLS_S.total(*size)
     return ComputingCost(time_s, memory_mb + _floor_mb(mission), _RENDERED_DISK_MB.total(*size))
 
 
