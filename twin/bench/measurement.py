@@ -1,4 +1,4 @@
-"""Rows of the benchmark: processor time of all threads beside that of a floor, measured in turn in one process."""
+"""Rows of the benchmark: processor time of all threads and that of a floor, measured in turn in one process."""
 
 import resource
 import subprocess

@@ -1,4 +1,4 @@
-"""Stages of a rendered survey, each beside its floor on the same images."""
+"""Stages of a rendered survey, each with its floor on the same images."""
 
 import time
 from collections.abc import Callable

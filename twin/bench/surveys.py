@@ -1,4 +1,4 @@
-"""Whole surveys: their cost beside the plain rendering of their frames, and their accuracy; surrogate, alignment."""
+"""Whole surveys: their cost relative to plain rendering of their frames, and their accuracy; surrogate, alignment."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

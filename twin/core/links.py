@@ -85,13 +85,11 @@ class Links(Sequence[Link]):
     def __getitem__(self, k: int | slice) -> Link | list[Link]:
         if isinstance(k, slice):
             return [self[index] for index in range(*k.indices(len(self)))]
-        i, j, i_from_j, information, overlap, n_points, shared_by, form, by_yaw, yaw_rad, by_image_errors = self._table[
-            k
-        ]
+        i, j, i_from_j, information, overlap, n_points, shared_by, form, by_yaw, yaw_rad, by_errors = self._table[k]
         numbers = float(overlap), int(n_points), float(shared_by)
         cov = symmetric_inverses(information[None])[0]
         form = None if np.isnan(form[0, 0]) else form
-        return Link(int(i), int(j), i_from_j, cov, *numbers, form, by_yaw, float(yaw_rad), by_image_errors)
+        return Link(int(i), int(j), i_from_j, cov, *numbers, form, by_yaw, float(yaw_rad), by_errors)
 
     @property
     def i(self) -> NDArray[np.int64]:

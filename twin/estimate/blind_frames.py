@@ -12,7 +12,7 @@ from twin.core.records import Readings, SensorNoise, StereoRig
 from twin.estimate.alignment import align
 from twin.estimate.vision.stereo import Keyframe
 
-_EXACT = np.eye(6) * 1e-10  # covariance of a measured frame: negligible beside that of a predicted motion
+_EXACT = np.eye(6) * 1e-10  # covariance of a measured frame: negligible next to that of a predicted motion
 _LEAST_VARIANCE = 1e-12  # of a motion along any direction [rad^2, m^2]
 
 

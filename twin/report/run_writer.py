@@ -161,8 +161,6 @@ class RunFolder:
             self._write(temporary, json.dumps(metrics, indent=1))
         self.log(metrics["status"], reason=metrics["reason"])
         (self.path / temporary).replace(self.path / "metrics.json")
-        for file in (self.path / "keyframes").glob("*_disparity.npy"):  # a checkpoint needs them until now
-            file.unlink(missing_ok=True)
         return metrics
 
     @property

@@ -36,15 +36,11 @@ class SurveyMonitor:
     Frames between keyframes that the compiled loop of a surrogate survey simulates are not given to it.
     """
 
-    def __init__(
-        self, mission: Mission, folder: RunFolder, progress: Callable[[SurveyProgress], None], live: bool = False
-    ):
+    def __init__(self, mission: Mission, folder: RunFolder, progress: Callable[[SurveyProgress], None]):
         self.n_frames, self.rate_hz = mission.n_frames, mission.rig.frame_rate_hz
         self.water = mission.scenario.water.label
         self.folder, self.progress, self.start_s = folder, progress, time.perf_counter()
         self.live = None
-        if live:
-            self.show_live(mission)
         self.status = "ok"
         longest_s = _WITH_DVL_S if "dvl" in mission.scenario.navigation.aiding else _MAX_BLIND_S
         self._measured = deque([True] * round(longest_s * self.rate_hz))

@@ -36,8 +36,8 @@ class SteppedWorld:
 
     `reset` starts the survey and returns its first frame; `step` moves the vehicle by one frame interval and returns
     the next frame of the plan. A frame holds images and sensor readings, no truth. The same seed and the same commands
-    give the same frames, bit for bit. Use one object in one thread. Before `reset`, all methods
-    and properties that need a flight raise RuntimeError. Raises ScenarioError if the survey cannot be flown.
+    give the same frames, bit for bit. Use one object in one thread. Before `reset`, all methods and properties that
+    need a flight raise RuntimeError. Raises ScenarioError if the survey cannot be flown.
     """
 
     def __init__(self, scenario: Scenario):

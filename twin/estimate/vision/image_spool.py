@@ -21,6 +21,12 @@ _Grays = tuple[matching.Gray, matching.Gray]  # of the left and the right image
 _CACHE_BYTES = 384 * 2**20
 
 
+def remove_disparities(folder: Path) -> None:
+    """Removes the disparities that an `ImageSpool` stored, after the last use of its keyframes."""
+    for file in folder.glob("*_disparity.npy"):
+        file.unlink(missing_ok=True)
+
+
 class ImageSpool:
     """Stores stereo pairs on disk as lossless PNG, with a cache of limited size of the last grey levels used.
 
