@@ -5,7 +5,9 @@ import pytest
 from seafloor_scene import digitise, down_camera, plane, render_view, small_rig
 
 from twin.core.records import MapGrid
+from twin.core.settings import EstimatorSettings
 from twin.estimate.mapping.map_builder import KeyframePath, build_map
+from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision import disparity
 from twin.estimate.vision.light_pattern import (
     DEGREE,
@@ -115,3 +117,20 @@ def test_the_difference_of_two_light_patterns_is_that_of_their_images():
     images = light_pattern(a, (600, 800)) - light_pattern(b, (600, 800)) - (a - b)[:, 0, 0, None, None]
     assert pattern_difference(a, b) == pytest.approx(np.sqrt((images**2).mean((1, 2))).max(), rel=0.02)
     assert pattern_difference(a, None) == pytest.approx(pattern_difference(None, a))
+
+
+def test_a_pair_is_matched_again_for_the_map_only_where_the_light_pattern_has_changed_noticeably(tmp_path):
+    pair, _ = faint_pair(0.0, 2.2, np.random.default_rng(6), contrast=1.0)
+    left, right = (np.repeat(image[..., None], 3, axis=2).astype(np.uint8) for image in pair)
+    pattern = np.zeros((2, DEGREE + 1, DEGREE + 1))
+    with StereoVision(RIG, EstimatorSettings(), tmp_path) as vision:
+        found = disparity.match_densely(*pair).fine
+        vision.spool.put(7, left, right, tuple(pair), found)
+        vision._known_patterns[7] = pattern
+        for change, known in ((0.1, True), (1.0, False)):
+            changed = pattern.copy()
+            changed[1, 1, 0] = change  # a slope of the right image; its RMS is 0.58 of this
+            image, other = vision._map_view(7, changed)
+            np.testing.assert_array_equal(image, left)
+            expected = found.disparity_px if known else right
+            np.testing.assert_allclose(other.disparity_px if known else other, expected, atol=0.002)

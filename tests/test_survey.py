@@ -64,6 +64,7 @@ def test_the_run_folder_contains_every_documented_file(flown):
     rasters = [f"dem{s}.tif" for s in ("", "_sigma", "_truth", "_error")]
     for name in [*names.split(), *rasters, *(f"trajectory_{t}.tum" for t in TRAJECTORIES), "keyframes"]:
         assert (flown.folder / name).exists(), name
+    assert not list((flown.folder / "keyframes").glob("*.npy"))  # disparities, which only the survey itself needs
     assert json.loads((flown.folder / "metrics.json").read_text()) == flown.metrics
 
 
