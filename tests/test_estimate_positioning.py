@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from twin.core import geometry
 from twin.core.links import Link, Links
-from twin.core.records import ElevationMap, Frame, Readings, SensorNoise
+from twin.core.records import ElevationMap, Frame, Readings, SensorNoise, StereoObservation
 from twin.core.settings import EstimatorSettings
 from twin.estimate import link_selection, stereo_vision
 from twin.estimate.navigation.pose_filter import PoseFilter, fuse_pressure_ahrs
@@ -628,6 +628,15 @@ def test_a_failed_step_between_keyframes_takes_the_misclosure(lost):
     assert np.delete(online, lost).max() < 1e-3
     assert np.delete(final, lost).max() < 1e-3
     assert final[lost] < 0.06  # half of the wrong step: the next one has the same variance
+
+
+@pytest.mark.parametrize("autocorrelation", [0.3, 0.9])
+def test_over_texture_that_repeats_the_final_path_is_the_online_one(autocorrelation):
+    camera = Script(line(0.3 * np.arange(8)), rng=np.random.default_rng(2))
+    camera.stereo_observations = [StereoObservation(k, 200, 0.5, repetition=autocorrelation) for k in range(8)]
+    result = navigated(camera, [1] * 8).finish()
+    apart_m = np.abs(result.final.positions - result.online.positions).max()
+    assert apart_m == 0 if autocorrelation > 0.5 else apart_m > 1e-6
 
 
 def navigated(camera, tracks, readings=None, **settings):

@@ -48,6 +48,7 @@ from twin.estimate.navigation.reading_watch import ReadingWatch
 from twin.estimate.network import KeyframeNetwork, LinkAttempt
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.trajectory import PoseLog, interpolate_between_keyframes
+from twin.estimate.vision.image_quality import MAX_REPETITION
 from twin.estimate.vision.mosaic import viewing_plane
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
@@ -374,15 +375,19 @@ class Navigator:
     def finish(self) -> SurveyResult:
         """Returns the result after the final global alignment of all nodes, unless it is switched off or abandoned.
 
-        Raises SurveyAborted or OSError if this fails; a second call returns the result without it.
+        Over texture that repeats, where links are ambiguous, the final trajectory is the online one. Raises
+        SurveyAborted or OSError if the alignment fails; a second call returns the result without it.
         """
         self.network.truncate(len(self.log))
         keyframes, history, log = self.network.keyframes, self.network.history, self.log
         cov = np.tile(self.filter.cov, (len(keyframes), 1, 1))
+        repeated = [pair.repetition for pair in self.vision.stereo_observations if pair.repetition is not None]
+        if ambiguous := bool(repeated) and float(np.median(repeated)) > MAX_REPETITION:
+            self.abandon_alignment()  # links may be wrong, and the alignment would spread their errors
         aligned_cov = self.network.align_all()
         rows, times_s = np.array([k.row for k in keyframes], dtype=np.int64), log.times_s.array
         final = log.online.array
-        if self.settings.use_ga and len(rows):
+        if self.settings.use_ga and len(rows) and not ambiguous:
             final = interpolate_between_keyframes(log.steps.array, log.variances.array, rows, self.network.poses)
             final = aligned(final, self._blind_frames, set(rows.tolist()), self.rig, self.network.noise)
         return SurveyResult(

@@ -216,9 +216,7 @@ class _Replayed:
         if frames.unused > most:
             text = f"{frames.unused} of {len(frames)} frames of the data set could not be used, see replay.skipped"
             found.append(Finding("frames_used", frames.unused, most, text))
-        if len(result.keyframe_rows):
-            found += check_survey(result, frames.rectification.rig, elevation)
-        return found
+        return found + check_survey(result, frames.rectification.rig, elevation)
 
     def evaluation(self, result: SurveyResult, maps: Maps) -> EvaluationInput:
         frames, times_s = self.opened.frames, result.online.times_s
