@@ -308,6 +308,15 @@ def test_a_full_disk_or_a_closed_stream_costs_one_line_at_most(arguments, stream
     assert ended.stderr.startswith(message) and len(ended.stderr.splitlines()) <= 1
 
 
+@pytest.mark.long
+def test_an_address_space_in_which_libraries_would_crash_is_one_line():
+    command = f"ulimit -v 1500000; {sys.executable} -m twin schema"
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    message = "memory: the limit of the address space (ulimit -v) is 1.5 GB (allowed: 3 GB or more)"
+    assert ended.stderr.strip() == message
+
+
 def test_an_image_that_a_full_disk_lost_costs_the_map_and_not_the_trajectories():
     class Navigator:
         def build_map(self, *_):

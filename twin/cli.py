@@ -92,6 +92,7 @@ def main() -> None:
     _set_up_openblas()
     with sigterm_as_interrupt():
         try:
+            console.refuse_little_memory()
             with console.machine_errors():
                 app()
         except TwinError as error:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from twin.session.monitor import SurveyProgress
 
 _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EIO, errno.EROFS)
+_ADDRESS_SPACE = 3_000_000_000  # smallest limit under which a small survey ends [bytes]
 
 
 def print_error(text: str) -> None:
@@ -46,6 +47,17 @@ def open_closed_streams() -> None:
         if getattr(sys, name) is None:
             os.dup2(os.open(os.devnull, os.O_RDWR), number)
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))
+
+
+def refuse_little_memory() -> None:
+    """Raises TwinError if the address space is limited to less than the libraries of a survey map: they would crash."""
+    if sys.platform == "win32":
+        return
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if 0 <= limit < _ADDRESS_SPACE:
+        raise TwinError("memory", f"the limit of the address space (ulimit -v) is {limit / 1e9:.2g} GB", "3 GB or more")
 
 
 @contextmanager
