@@ -68,15 +68,15 @@ def crash_in_turbid_water(survey):
 
 
 class SerialEngine:
-    """Engine that runs tasks one after another in this process, and simulates Ctrl-C before a given task."""
+    """Engine that runs tasks one after another in this process, and raises `reason` before a given task."""
 
-    def __init__(self, stop_before=None):
-        self.stop_before, self.flown = stop_before, []
+    def __init__(self, stop_before=None, reason=KeyboardInterrupt):
+        self.stop_before, self.reason, self.flown = stop_before, reason, []
 
     def run_many(self, function, tasks, limits):
         for task in tasks:
             if len(self.flown) == self.stop_before:
-                raise KeyboardInterrupt
+                raise self.reason
             self.flown.append(task.key)
             try:
                 yield Outcome(task, function(task), "", 1)

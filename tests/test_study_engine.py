@@ -13,7 +13,7 @@ import study_tasks
 
 from twin.engines.engine import LocalEngine, open_engine
 from twin.engines.worker import OUT_OF_TIME, TaskLimits, WorkerPool
-from twin.errors import TwinError
+from twin.errors import EngineLostError, TwinError
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +145,21 @@ def test_a_dask_cluster_gives_the_outcomes_of_a_local_engine_even_if_it_loses_a_
                     os.kill(cluster.workers[0].pid, signal.SIGKILL)
                 squares[outcome.task] = outcome.result
     assert squares == {k: k * k for k in range(20)}
+
+
+@pytest.mark.long
+def test_a_cluster_that_has_lost_all_workers_for_long_is_given_up(monkeypatch):
+    from distributed import LocalCluster
+
+    monkeypatch.setattr("twin.engines.dask_engine._WITHOUT_WORKERS_S", 1.0)
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        with open_engine(scheduler=cluster.scheduler_address) as engine:
+            done = []
+            with pytest.raises(EngineLostError, match="all workers were lost for 1 s"):
+                for outcome in engine.run_many(study_tasks.slow_square, range(50), TaskLimits()):
+                    done.append(outcome.result)
+                    cluster.scale(0)
+    assert done
 
 
 def test_workers_end_when_their_parent_process_is_killed():

@@ -10,7 +10,7 @@ from study_surveys import STUDY, SerialEngine, study_of
 from twin.app import study_command
 from twin.engines.engine import open_engine
 from twin.engines.worker import Outcome
-from twin.errors import ScenarioError, TwinError
+from twin.errors import EngineLostError, ScenarioError, TwinError
 from twin.studies import runner, sentences
 from twin.studies.flight import flatten, has_passed
 from twin.studies.progress import StudyProgress
@@ -90,8 +90,11 @@ def test_unfinished_run_folders_are_removed_on_resume(study, tmp_path):
     assert not unfinished.exists()
 
 
-def test_an_interrupted_study_is_continued_on_resume(study, table, tmp_path):
-    first, second = SerialEngine(stop_before=5), SerialEngine()
+@pytest.mark.parametrize(
+    "reason", [KeyboardInterrupt, EngineLostError("--scheduler", "all workers were lost for 300 s")]
+)
+def test_an_interrupted_study_is_continued_on_resume(study, table, tmp_path, reason):
+    first, second = SerialEngine(5, reason), SerialEngine()
     assert run_study(study, tmp_path / "out", first).interrupted
     assert rows(tmp_path / "out").num_rows == 5
     run_study(study, tmp_path / "out", second, resume=True)

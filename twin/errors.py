@@ -38,6 +38,10 @@ class UnmodelledError(ScenarioError):
     """The surrogate cannot simulate a valid scenario; with rendered images it can be flown."""
 
 
+class EngineLostError(TwinError):
+    """A cluster cannot run further surveys; the results obtained until then are kept."""
+
+
 class SurveyAborted(Exception):  # noqa: N818 (an outcome of a survey, not an input error)
     """The survey cannot continue (physics diverged, vision lost, alignment failed); partial results are kept."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -13,12 +14,13 @@ import dask.config
 from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
 
 from twin.engines.worker import Outcome, Result, Task, TaskLimits, WorkerPool, describe_exception
-from twin.errors import TwinError
+from twin.errors import EngineLostError, TwinError
 
 _CONNECT_TIMEOUT_S = 20
 _QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all tasks (up to 100,000) at once
 _MIN_QUEUED = 64
 _REFRESH_S = 2.0
+_WITHOUT_WORKERS_S = 300.0  # tasks are given up after this time without any worker, if there was one before
 _MAX_LOST_WORKERS = 3  # in SLURM jobs, a task fails if more Dask workers than this are lost while they run it
 
 
@@ -65,21 +67,25 @@ class DaskEngine:
     def run_many(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
     ) -> Iterator[Outcome[Task, Result]]:
-        """See `Engine.run_many`; resubmits the tasks of a lost worker; raises TwinError if the connection is lost."""
-        waiting, running = iter(tasks), {}
+        """See `Engine.run_many`; resubmits the tasks of a lost worker.
+
+        Raises EngineLostError if the connection is lost, or all workers for `_WITHOUT_WORKERS_S`.
+        """
+        waiting, running = iter(tasks), dict[Any, tuple[Task, Future]]()
         arriving = as_completed(with_results=True, raise_errors=False)
 
         def submit() -> None:
             for task in islice(waiting, max(0, self._queue_size() - len(running))):
                 future = self.client.submit(_run_task, function, task, limits, pure=False)
-                running[future.key] = task
+                running[future.key] = task, future
                 arriving.add(future)
 
         submit()
-        for future, result in arriving:
-            yield _outcome(running.pop(future.key), future, result)
-            future.release()
-            submit()
+        with _cancelled_without_workers(self.client, running) as lost:
+            for future, result in arriving:
+                yield _outcome(running.pop(future.key)[0], future, result, lost)
+                future.release()
+                submit()
 
     def _queue_size(self) -> int:
         if time.monotonic() - self._updated_s > _REFRESH_S:
@@ -104,11 +110,37 @@ def _run_task(function: Callable[[Task], Result], task: Task, limits: TaskLimits
     return plugin.pool.run(function, task, limits)
 
 
-def _outcome(task: Any, future: Future, result: Any) -> Outcome:
+@contextmanager
+def _cancelled_without_workers(client: Client, running: dict[Any, tuple[Any, Future]]) -> Iterator[threading.Event]:
+    """Cancels the running tasks if all workers are lost for `_WITHOUT_WORKERS_S`; yields an event that says so."""
+    lost, ended = threading.Event(), threading.Event()
+
+    def watch() -> None:
+        seen_s = math.inf
+        while not lost.is_set():
+            now_s = time.monotonic()
+            seen_s = now_s if client.nthreads() else seen_s
+            if now_s - seen_s > _WITHOUT_WORKERS_S:
+                lost.set()
+                client.cancel([future for _, future in list(running.values())], force=True)
+            elif ended.wait(_REFRESH_S):
+                return
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield lost
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _outcome(task: Any, future: Future, result: Any, lost: threading.Event) -> Outcome:
     if future.status == "finished":
         return result
     if future.status != "error":
-        raise TwinError("--scheduler", "the connection was lost", "a running scheduler; continue with --resume")
+        problem = f"all workers were lost for {_WITHOUT_WORKERS_S:g} s" if lost.is_set() else "the connection was lost"
+        raise EngineLostError("--scheduler", problem, "a running scheduler with workers; continue with --resume")
     error: Any = result[1] if isinstance(result, tuple) else future.exception()
     if isinstance(error, KilledWorker):
         return Outcome(task, None, "the Dask workers that ran the task were lost", error.allowed_failures + 1)

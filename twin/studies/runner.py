@@ -13,7 +13,7 @@ from twin.core.checkpoint import check_inputs
 from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
 from twin.engines.engine import Engine
 from twin.engines.worker import OUT_OF_TIME, Outcome, TaskLimits
-from twin.errors import TwinError
+from twin.errors import EngineLostError, TwinError
 from twin.scenario.file import input_files
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import Row, fly, refused_row, row_of
@@ -37,7 +37,7 @@ class StudyResult(NamedTuple):
     analysis: StudyAnalysis
     page: Path  #: file of the report
     write_errors: list[str]  #: messages of the errors that occurred while the results were written
-    interrupted: bool  #: whether Ctrl-C ended the study
+    interrupted: bool  #: whether Ctrl-C, or the loss of the engine, ended the study
     throughput: Throughput  #: number of surveys flown by this call, and their run times
 
 
@@ -54,9 +54,9 @@ class Fleet(NamedTuple):
         return time.time() >= self.end_s
 
     def fly(self, study: Study, missing: Iterable[Survey], add_row: Callable[[Row], None]) -> bool:
-        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C.
+        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted.
 
-        At the end of the budget, surveys without a result are left out.
+        Ctrl-C and the loss of the engine interrupt. At the end of the budget, surveys without a result are left out.
         """
         limits = TaskLimits(study.timeout_s, study.retries, self.end_s)
         try:
@@ -69,16 +69,19 @@ class Fleet(NamedTuple):
                 self.progress.add(row)
         except KeyboardInterrupt:
             return False
+        except EngineLostError as error:
+            self.progress.print_line(str(error))
+            return False
         return True
 
 
 def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet, render_refused: bool = False) -> StudyResult:
     """Flies the surveys for which the folder has no result; writes results.parquet, study.html and any agreement.
 
-    With `render_refused`, surveys that only the surrogate refuses are then flown with rendered images. Ctrl-C or the
-    end of the budget ends the study early; the results obtained until then are written. Raises TwinError if the folder
-    is not empty and `resume` is not set, is written by another process, cannot be written or belongs to another study,
-    or if the engine lost its connection; ScenarioError, before any flight, if no sample has a valid scenario.
+    With `render_refused`, surveys that only the surrogate refuses are then flown with rendered images. Ctrl-C, the end
+    of the budget or the loss of the engine ends the study early; the results obtained until then are written. Raises
+    TwinError if the folder is not empty and `resume` is not set, is written by another process, cannot be written or
+    belongs to another study; ScenarioError, before any flight, if no sample has a valid scenario.
     """
     if render_refused and FIDELITY in study.varied_keys:
         raise TwinError("--render-refused", f"this study varies {FIDELITY}", "a study with the surrogate alone")
