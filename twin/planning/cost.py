@@ -15,6 +15,7 @@ class ComputingCost(NamedTuple):
     wall_s: float  #: processor time, of all threads [s]
     memory_mb: float  #: peak memory [MB]
     disk_mb: float  #: disk space of the run folder [MB]
+    flight_disk_mb: float  #: disk space until the maps are made, with the disparities of keyframes [MB]
 
 
 class _Coefficients(NamedTuple):
@@ -35,6 +36,7 @@ _RENDERED_S = _Coefficients(start=9.7, frame=0.0087, frame_mpx=0.221, keyframe=0
 _OBJECTS_S = _Coefficients(start=4.0, frame=0.022)  # in addition, with objects in the images
 _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
 _RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=4.2)
+_DISPARITY_MB_PER_MPX = 4.0  # of one keyframe: two numbers of 16 bits a pixel
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
 _RENDERED_MB = _Coefficients(start=813.0, keyframe_mpx=7.0)
 _IMAGES_MB_PER_MPX = 300.0
@@ -49,12 +51,15 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
     megapixels = mission.rig.width_px * mission.rig.height_px / 1e6
     size = mission.n_frames, n_keyframes, megapixels
     if mission.scenario.imaging.fidelity == "surrogate":
-        return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB, _SURROGATE_DISK_MB.total(*size))
+        disk_mb = _SURROGATE_DISK_MB.total(*size)
+        return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB, disk_mb, disk_mb)
     window_tracks = mission.scenario.estimator_settings().window_tracks
     window = round(n_keyframes * min(1.0, (window_tracks + 1) / len(mission.tracks)))
     memory_mb = _RENDERED_MB.total(mission.n_frames, window, megapixels) + _IMAGES_MB_PER_MPX * megapixels
     time_s = _RENDERED_S.total(*size) + (_OBJECTS_S.total(*size) if mission.objects else 0.0)
-    return ComputingCost(time_s, memory_mb + _floor_mb(mission), _RENDERED_DISK_MB.total(*size))
+    disk_mb = _RENDERED_DISK_MB.total(*size)
+    flight_disk_mb = disk_mb + n_keyframes * megapixels * _DISPARITY_MB_PER_MPX
+    return ComputingCost(time_s, memory_mb + _floor_mb(mission), disk_mb, flight_disk_mb)
 
 
 def _floor_mb(mission: Mission) -> float:

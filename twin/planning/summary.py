@@ -251,7 +251,8 @@ def _swath_spacing(mission: Mission) -> str:
 def _cost_text(cost: ComputingCost) -> str:
     minutes = cost.wall_s / 60
     time = f"{cost.wall_s:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
-    return f"about {time} of processor time, {cost.memory_mb / 1000:.1f} GB of memory, {cost.disk_mb:.0f} MB of disk"
+    disk = f"{cost.disk_mb:.0f} MB of disk ({cost.flight_disk_mb:.0f} MB until it ends)"
+    return f"about {time} of processor time, {cost.memory_mb / 1000:.1f} GB of memory, {disk}"
 
 
 def floor_rows(summary: PlanSummary) -> list[tuple[str, ...]]:
