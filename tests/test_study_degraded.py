@@ -111,7 +111,7 @@ def test_the_plans_of_a_search_are_listed_with_the_completeness(tmp_path):
     changes = [{"map.le90_area_m": 0.01, "map.completeness_area": 0.95 + 0.01 * k} for k in range(5)]
     study, candidate = evaluated(tmp_path, changes)
     assert candidate.completeness == (("map.completeness_area", pytest.approx(0.97)),)
-    result = TuningResult(study, [candidate], [candidate], [], None, candidate, None, None, False, False, False, {})
+    result = TuningResult(study, [candidate], [candidate], [], None, candidate, None, "", None, False, False, False, {})
     tuning_report.write_tuning_report(result, tmp_path)
     assert "<th>map completeness (asked area)</th>" in (tmp_path / "tuning.html").read_text()
 

@@ -1,5 +1,7 @@
 """A search finds the best feasible plan, confirms it with new seeds, and does not depend on interruptions."""
 
+import re
+
 import optuna
 import pyarrow.parquet as pq
 import pytest
@@ -97,7 +99,9 @@ def test_the_recommended_scenario_reads_back_with_the_chosen_values(searched):
     assert scenario.estimate.node_stride == result.recommended.values["estimate.node_stride"]
     assert scenario.water == load_scenario("reef").water
     page = (folder / "tuning.html").read_text()
-    assert page.index("Recommended plan: plan.altitude_m = ") < page.index("<img")
+    flown = r"Fly 1\.9\d m above the reference plane at 0\.35 m/s, legs [\d.]+ c?m apart \([\d.]+ min, one dive\): "
+    assert re.search(flown, page)
+    assert page.index("In the scenario, plan.altitude_m = 1.9") < page.index("<img")
     assert (folder / "pareto.png").stat().st_size > 5000
 
 

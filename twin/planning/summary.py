@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from twin.controllers.forecast import Forecast, forecast
 from twin.core.geometry import Array
+from twin.core.quality import Energy
 from twin.imaging.light.spectra import provenance_of
 from twin.judge.summary_statistics import finite_tree
 from twin.judge.verdict import judge_requirements
@@ -223,10 +224,25 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
     ]
 
 
+def instructions(mission: Mission) -> str:
+    """Returns what to fly, e.g. "Fly 2.1 m above the floor at 0.35 m/s, legs 0.9 m apart (41 min, one dive)"."""
+    plan, scenario = mission.plan, mission.scenario
+    floor = "floor" if plan.follows_floor else "reference plane"
+    legs = f", {_SWATHS[scenario.plan.pattern][0]}s {_swath_spacing(mission)} apart" if plan.swath_spacing_m else ""
+    time = f"{mission.n_frames / mission.rig.frame_rate_hz / 60:.2g} min"
+    dives = f", {_dives(planned_energy(mission))}" if scenario.vehicle.dynamics == "rigid" else ""
+    return f"Fly {length(scenario.plan.altitude_m)} above the {floor} at {plan.speed_mps:.2g} m/s{legs} ({time}{dives})"
+
+
+def _dives(energy: Energy) -> str:
+    return "one dive" if energy.dives == 1 else f"{energy.dives} dives"
+
+
 def _energy_text(mission: Mission) -> str:
     vehicle, energy = mission.scenario.vehicle, planned_energy(mission)
-    dives = "one dive" if energy.dives == 1 else f"{energy.dives} dives"
-    return f"{energy.survey_wh:.3g} W h: {dives} with a battery of {vehicle.battery_wh:g} W h, a fifth in reserve"
+    return (
+        f"{energy.survey_wh:.3g} W h: {_dives(energy)} with a battery of {vehicle.battery_wh:g} W h, a fifth in reserve"
+    )
 
 
 def _tasks(mission: Mission) -> list[str]:

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from twin.core.checkpoint import check_inputs
+from twin.planning.summary import instructions
 from twin.report.number_formats import percent
 from twin.scenario.file import input_files
 from twin.scenario.model import Scenario
@@ -31,6 +32,7 @@ from twin.tuning.candidates import (
 from twin.tuning.correction import correction_at
 from twin.tuning.search import Search
 from twin.tuning.verification import Verification, verification_of
+from twin.world.mission import prepare
 
 START = -1  #: number of the starting plan, that of the scenario
 _START_SURVEYS = 3  # rendered surveys of the starting plan
@@ -55,6 +57,7 @@ class TuningResult(NamedTuple):
     #: more of them could raise, or else confirmed by the surrogate; None if there is none
     unproven: Candidate | None
     scenario: Scenario | None  #: scenario of the recommended or unproven plan; None if there is none
+    instructions: str  #: what this plan is to fly (`twin.planning.summary.instructions`)
     start: Verification | None  #: the plan of the scenario, if a plan is recommended and its surveys were flown
     interrupted: bool  #: whether Ctrl-C ended the search
     out_of_time: bool  #: whether the budget was used up
@@ -155,6 +158,7 @@ class Tuning:
         recommended = None if interrupted else self.recommended
         unproven = None if recommended or interrupted else self.unproven
         plan = recommended or unproven
+        scenario = self.trials.scenario(plan.values) if plan else None
         return TuningResult(
             self.study,
             self._candidates(),
@@ -162,7 +166,8 @@ class Tuning:
             list(self.verifications.values()),
             recommended,
             unproven,
-            self.trials.scenario(plan.values) if plan else None,
+            scenario,
+            instructions(prepare(scenario)) if scenario else "",
             self.start,
             interrupted,
             out_of_time,

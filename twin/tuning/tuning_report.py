@@ -83,9 +83,9 @@ def headline(result: TuningResult) -> str:
     )
     return " ".join(
         [
-            f"Recommended plan: {_values(chosen)}. {verification.counts()}: {verification.state()}. Medians rendered "
-            f"(surrogate): {medians}; by the surrogate, pass probability with new seeds "
-            f"{sentences.confidence(chosen.pass_probability)}. {count}.",
+            f"{result.instructions}: {verification.counts()}; {verification.state()}. Medians rendered (surrogate): "
+            f"{medians}; by the surrogate, pass probability with new seeds "
+            f"{sentences.confidence(chosen.pass_probability)}. {count}. In the scenario, {_values(chosen)}.",
             *_cheaper(result),
             *(["The budget was used up before cheaper plans were tried."] if result.out_of_time else []),
         ]
@@ -114,8 +114,9 @@ def _missing_plan(result: TuningResult, count: str) -> str:
             flown = f"{verification.counts()}; {verification.state()}"
         predicted = sentences.confidence(plan.pass_probability)
         return (
-            f"none is shown to reach {required} in rendered surveys. The closest one: {_values(plan)}; {flown}. By the "
-            f"surrogate, pass probability with new seeds {predicted}. {count}.{budget}"
+            f"none is shown to reach {required} in rendered surveys. The closest one: {result.instructions}; {flown}. "
+            f"By the surrogate, pass probability with new seeds {predicted}. {count}.{budget} In the scenario, "
+            f"{_values(plan)}."
         )
     if not result.verifications:
         return f"{count}, and none reached the required pass probability of {required} with new seeds.{budget}"
