@@ -82,19 +82,14 @@ def headline(result: TuningResult) -> str:
         for name, (surrogate, rendered) in verification.medians.items()
         if rendered is not None
     )
-    return " ".join(
-        [
-            f"Recommended plan: {_values(chosen)}. {verification.counts()}: {verification.state()}. Medians rendered "
-            f"(surrogate): {medians}; by the surrogate, pass probability with new seeds "
-            f"{sentences.confidence(chosen.pass_probability)}. {count}.",
-            *(
-                [f"The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}."]
-                if failed
-                else []
-            ),
-            *(["The budget was used up before cheaper plans were tried."] if result.out_of_time else []),
-        ]
+    text = (
+        f"Recommended plan: {_values(chosen)}. {verification.counts()}: {verification.state()}. Medians rendered "
+        f"(surrogate): {medians}; by the surrogate, pass probability with new seeds "
+        f"{sentences.confidence(chosen.pass_probability)}. {count}."
     )
+    if failed:
+        text += f" The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}."
+    return text + (" The budget was used up before cheaper plans were tried." if result.out_of_time else "")
 
 
 def _values(plan: Candidate) -> str:
