@@ -11,8 +11,7 @@ from twin.core.user_files import reading
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, decoded, height_error
 from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
-from twin.terrains.input_statement import InputStatement
-from twin.terrains.terrain import Terrain, texture_shape
+from twin.terrains.terrain import InputStatement, Terrain, texture_shape
 from twin.terrains.textures import TextureSource, generate_texture, texture_from_photo
 from twin.terrains.vertical_axis import Direction, HeightFile, VerticalAxis, direction_of
 from twin.terrains.walls import walls_of

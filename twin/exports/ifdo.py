@@ -15,8 +15,7 @@ from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes, read_json
 from twin.datasets.calibration import RecordedCamera
 from twin.datasets.image_copy import copy_all
 from twin.datasets.run_contents import RecordedFrame, RunContents
-from twin.exports.attitude import yaw_pitch_roll_deg
-from twin.exports.geographic_place import WGS84, Place, place_of, transformed
+from twin.exports.geographic_place import WGS84, Place, place_of, transformed, yaw_pitch_roll_deg
 
 _START = datetime(1970, 1, 1, tzinfo=UTC)  # a run has no date
 #: Fields of the whole image set: of all sets, of simulated images, and of the rectified images of a replay, of whose

@@ -6,7 +6,7 @@ from twin.core.georeference import Georeference
 from twin.core.records import Array
 from twin.datasets.image_copy import copy_all
 from twin.datasets.run_contents import RunContents
-from twin.exports.attitude import yaw_pitch_roll_deg
+from twin.exports.geographic_place import yaw_pitch_roll_deg
 
 _HEADER = "#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll"
 

@@ -22,11 +22,10 @@ from twin.imaging.scene.object_shadows import FROM_ABOVE
 from twin.imaging.scene.object_view import Objects, draw_objects
 from twin.scenario.model import Scenario, TerrainConfig
 from twin.terrains.holes import known_nodes
-from twin.terrains.input_statement import InputStatement
 from twin.terrains.objects.coloured_mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
 from twin.terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
-from twin.terrains.terrain import texture_shape
+from twin.terrains.terrain import InputStatement, texture_shape
 from twin.terrains.vertical_axis import ASSUMED
 from twin.world.top_surface import FROM_BELOW, OVERHANG_M, Layer, TopSurface, row_blocks, true_heights, view_from_above
 
