@@ -35,7 +35,10 @@ class _SurveyEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """What both environments share: the world, the action and the target of the controller."""
 
     def __init__(self, given: Scenario, action: str):
-        _check_action(given, action)
+        if action not in ("velocity", "thrust") or (action == "thrust" and given.vehicle.dynamics != "rigid"):
+            raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
+        if action == "velocity" and given.vehicle.is_steered_by_fins:
+            raise TwinError("action", f"{action!r}: not for a vehicle that is steered by fins", '"thrust"')
         self.world, self._velocity_action = SteppedWorld(given), action == "velocity"
         self._most_mps = SPEED_RATIO * given.plan.speed_mps
         n = 4 if self._velocity_action else given.vehicle.n_commands
@@ -323,13 +326,6 @@ def moved(last: Reference, values: Array, most_mps: float, interval_s: float) ->
     forward, left, up = values[:3] * most_mps
     velocity = np.array([c * forward - s * left, s * forward + c * left, up])
     return Reference(last.position + velocity * interval_s, velocity, yaw, np.zeros(3))
-
-
-def _check_action(scenario: Scenario, action: str) -> None:
-    if action not in ("velocity", "thrust") or (action == "thrust" and scenario.vehicle.dynamics != "rigid"):
-        raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
-    if action == "velocity" and scenario.vehicle.is_steered_by_fins:
-        raise TwinError("action", f"{action!r}: not for a vehicle that is steered by fins", '"thrust"')
 
 
 def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import uuid
-from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -61,15 +60,11 @@ def _header(contents: RunContents, place: Place | None) -> dict[str, Any]:
     if "replay" not in contents.scenario:
         vehicle = contents.scenario.get("vehicle", {}).get("title", "vehicle")
         fields["image-platform"] = {"name": f"{vehicle}, simulated"}
-        fields["image-illumination"] = _illumination(contents.scenario)
+        lamps, sun = contents.scenario.get("lamps"), contents.scenario.get("sun", {}).get("illuminance_lx", 0.0) > 0
+        fields["image-illumination"] = "sunlight" if not lamps else "mixed light" if sun else "artificial light"
     if place is None:
         return fields | {"image-abstract": fields["image-abstract"] + _LOCAL}
     return fields | {"image-coordinate-reference-system": WGS84}
-
-
-def _illumination(scenario: Mapping[str, Any]) -> str:
-    lamps, sun = bool(scenario.get("lamps")), scenario.get("sun", {}).get("illuminance_lx", 0.0) > 0
-    return "mixed light" if lamps and sun else "artificial light" if lamps else "sunlight"
 
 
 def _calibration(camera: RecordedCamera) -> dict[str, Any]:

@@ -169,8 +169,9 @@ def read_area(file: Path, terrain: Terrain) -> list[list[Array]]:
     if not np.isfinite(corners).all():
         raise TwinError(KEY, f"{file.name!r} has a coordinate that is not finite", "finite numbers")
     origin = _georeference(KEY, terrain)
-    if crs is None and _is_longitude_latitude(corners, terrain, origin):
-        crs = _LONGITUDE_LATITUDE
+    if crs is None and origin.crs_wkt is not None and (np.abs(corners) <= [180.0, 90.0]).all():
+        is_off_the_dem = np.isnan(terrain.height_at(*origin.to_scene(*corners.T))).all()
+        crs = _LONGITUDE_LATITUDE if is_off_the_dem else None
     if crs is not None:
         corners = _projected(corners, crs, origin)
     lengths = [len(ring.coords) for polygon in rings for ring in polygon]
@@ -195,12 +196,6 @@ def _named_crs(tree: Any) -> str | None:
         return str(tree["crs"]["properties"]["name"])
     except (KeyError, TypeError):
         return None
-
-
-def _is_longitude_latitude(corners: Array, terrain: Terrain, origin: Georeference) -> bool:
-    within = (np.abs(corners) <= [180.0, 90.0]).all()
-    x, y = origin.to_scene(*corners.T)
-    return bool(within and origin.crs_wkt is not None and np.isnan(terrain.height_at(x, y)).all())
 
 
 def _projected(corners: Array, crs: str, origin: Georeference) -> Array:

@@ -59,7 +59,8 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     whole, top = raised(whole, -lowest_m), top - lowest_m
     upward = upward_part(whole.mesh)
     tiles = tiles_of(whole)
-    drawn, nearest = Objects((), floor=tiles), _nearest(covered)
+    rows, cols = distance_transform_edt(~covered, return_distances=False, return_indices=True)  # pyright: ignore
+    drawn, nearest = Objects((), floor=tiles), (rows, cols)
     top_m = top[nearest]
     colours = _colours(drawn, grid, grid.cell_m)[0][nearest]
     low = _lowest(upward, grid)
@@ -132,11 +133,6 @@ def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
     cells = np.clip(row, 0, grid.rows - 1).astype(np.int64), np.clip(col, 0, grid.cols - 1).astype(np.int64)
     np.minimum.at(low, cells, z)
     return low
-
-
-def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    rows, cols = distance_transform_edt(~covered, return_distances=False, return_indices=True)  # pyright: ignore
-    return rows, cols
 
 
 def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArray[np.bool_]]:

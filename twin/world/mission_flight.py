@@ -48,10 +48,6 @@ class PathChange(NamedTuple):
 _SAME_FACTOR = 0.01  # a factor of the pace that differs by less is set to the one that it approaches
 
 
-def _no_further_path(last: Reference, end: Point) -> tuple[Segment, ...]:
-    return ()
-
-
 class Flight:
     """Flight of a mission through its world: all tracks, with station keeping after each of them.
 
@@ -75,7 +71,7 @@ class Flight:
         self._change, self._is_changed = PathChange(np.zeros(3), np.zeros(3), 0), False
         self.pace_factor = self._factor = 1.0
         self.aligns, self.n_skipped = False, 0
-        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = _no_further_path
+        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = lambda last, end: ()
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"fast_forward": None}
