@@ -34,12 +34,9 @@ class FinAutopilot:
     def inputs(
         self, pose: Array, twist: Array, position: Array, velocity: Array, acceleration: Array, is_measured: bool
     ) -> Array:
-        """Returns the inputs (n,) for one period, and updates the state.
+        """Returns the inputs (n,) for one period, and updates the state, as `tracking.control_thrusters` does.
 
-        Args:
-            pose, twist: estimated pose world_from_body (4, 4), and [angular, linear] velocity (6,) in the body.
-            position, velocity, acceleration: `Reference` of the body in the world.
-            is_measured: whether the motion was measured; else integrals and current are kept.
+        Unless the motion was measured, integrals and current are kept.
         """
         through, course = velocity[:2] - self._current, np.arctan2(velocity[1], velocity[0])
         speed = float(np.hypot(*through))

@@ -38,14 +38,10 @@ def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: 
 
     A mesh may be open, as photogrammetric models are, but no edge may belong to more than two triangles, of which those
     with the same corners as an earlier one are left out. A texture is sampled at the vertices, after the triangles have
-    been divided.
+    been divided. `albedo`, 0 to 1, is that of a mesh without colours; with `y_up`, y of the file points up, not z.
 
-    Args:
-        field: scenario key of the file, for error messages.
-        albedo: albedo of a mesh without colours, 0 to 1.
-        y_up: whether y of the file points up, instead of z.
-    Raises:
-        TwinError: the file is missing, unreadable or too large, has no triangles or extent, or is not manifold.
+    Raises TwinError, with the key `field`, if the file is missing, unreadable or too large, has no triangles or extent,
+    or is not manifold.
     """
     grey = np.rint(np.asarray(albedo) * 255)
     with _parts_of(file, field) as parts:

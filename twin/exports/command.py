@@ -51,16 +51,12 @@ def export(
     """Writes a run in several formats, each into the subfolder of `out` with the name of the format; returns the files.
 
     A subfolder appears when its format is complete; until then its files are in a hidden folder `.FORMAT.partial`,
-    which an error or an interrupt removes.
+    which an error or an interrupt removes. `progress` gets the name of a format and the completed fraction of it, 0 to
+    1, and `warn` each sentence on a file that is missing in the run folder (`RunContents.notes`).
 
-    Args:
-        progress: called with the name of a format and the completed fraction of it, 0 to 1.
-        warn: called with each sentence on a file that is missing in the run folder (`RunContents.notes`).
-
-    Raises:
-        TwinError: a format, an option or the run folder is not valid, the run lacks contents that a format needs, or a
-            subfolder is not empty or cannot be written; nothing was written. Or a package is missing, an image or the
-            true poses are damaged, or a file has the name of the hidden folder; earlier formats were written.
+    Raises TwinError if a format, an option or the run folder is not valid, the run lacks contents that a format needs,
+    or a subfolder is not empty or cannot be written; nothing was written. Or a package is missing, an image or the true
+    poses are damaged, or a file has the name of the hidden folder; earlier formats were written.
     """
     chosen = chosen_formats(names)
     contents = run_contents(folder, options)

@@ -64,9 +64,8 @@ def true_layers(
 ) -> tuple[list[str], Iterator[FrameTruth]]:
     """Returns the names of the objects, by label from 1, and the layers of the recorded frames, rendered when iterated.
 
-    Raises:
-        TwinError: frames/truth.npz, which has the true poses, is damaged, or the scenario can no longer be prepared;
-            while iterating: a recorded image cannot be read or has another size than those of the run.
+    Raises TwinError where frames/truth.npz, which has the true poses, is damaged, or the scenario can no longer be
+    prepared; while iterating, where a recorded image cannot be read or has another size than those of the run.
     """
     poses, twists = _true_motion(folder / "frames" / "truth.npz", max(frame.index for frame in frames))
     mission = prepare(scenario)

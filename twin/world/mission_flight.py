@@ -51,17 +51,8 @@ _SAME_FACTOR = 0.01  # a factor of the pace that differs by less is set to the o
 class Flight:
     """Flight of a mission through its world: all tracks, with station keeping after each of them.
 
-    Args:
-        fast_forward: simulates frames between keyframes quickly (`World.fast_forward`); None: every frame is returned.
-            A checkpoint leaves it out.
-
-    Attributes:
-        aligns: whether the network is aligned before the current frame is estimated: it is the first one of the second
-            half of the station keeping after a track.
-        n_skipped: number of frames that `fast_forward` simulated in the last step.
-        further_path: called with the last reference and the end of the path after its last track; returns the path of
-            one more track, () for none.
-        pace_factor: factor of the pace along the path, above 0 to 1, which is approached smoothly.
+    `fast_forward` simulates frames between keyframes quickly (`World.fast_forward`); without, every frame is returned.
+    A checkpoint leaves it out.
     """
 
     def __init__(self, mission: Mission, world: World, fast_forward: FastForward | None = None):
@@ -69,8 +60,11 @@ class Flight:
         self.fast_forward, self._n_parts = fast_forward, 0
         self._mission = mission  # with the heights that the path has now
         self._change, self._is_changed = PathChange(np.zeros(3), np.zeros(3), 0), False
-        self.pace_factor = self._factor = 1.0
-        self.aligns, self.n_skipped = False, 0
+        self.pace_factor = self._factor = 1.0  #: of the pace along the path, above 0 to 1, which is approached smoothly
+        #: whether the network is aligned before this frame, the first of the second half of the station keeping
+        self.aligns = False
+        self.n_skipped = 0  #: number of frames that `fast_forward` simulated in the last step
+        #: path of one more track after the last reference and the end of the path, () for none
         self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = lambda last, end: ()
 
     def __getstate__(self) -> dict[str, Any]:
