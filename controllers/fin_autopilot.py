@@ -17,13 +17,10 @@ _CURRENT_S = 6.0  # time constant of the estimate of the current; at first, that
 class FinAutopilot:
     """Autopilot with its state: integrals of the position error, and the estimate of the current across the bow.
 
-    Args:
-        curvatures: (k,) of circles, increasing, positive to the left [1/m].
-        trims: (k, 9 + n) on them, at the cruise speed: roll, pitch, yaw minus course [rad], [angular, linear] velocity
-            in body axes, inputs.
-        gains: (n, 15) feedback gains K of the errors of position along the course, to its left and up, of roll, pitch,
-            yaw, twist, and of the integrals of the position errors.
-        most: (n,) greatest inputs, thrusts [N] and then angles of fins [rad]; backwards the same.
+    The trims (k, 9 + n) are those at the cruise speed on circles of the curvatures (k,), increasing, positive to the
+    left [1/m]: roll, pitch, yaw minus course [rad], [angular, linear] velocity in body axes, inputs. The gains K (n,
+    15) are of the errors of position along the course, to its left and up, of roll, pitch, yaw, twist, and of the
+    integrals of the position errors. `most` (n,) are the greatest thrusts [N] and then angles of fins [rad].
     """
 
     def __init__(self, curvatures: Array, trims: Array, gains: Array, most: Array, speed_mps: float, period_s: float):

@@ -1075,17 +1075,13 @@ class ControlConfig(Section):
     the shorter side of the footprint [m]"""
 
 
+SENSORS = ("pressure", "ahrs", "dvl", "usbl")  #: that can fail
 #: Parts that can fail, with the ways in which they can, in the words of PX4.
 FAULTS: dict[str, tuple[str, ...]] = {
     "thruster": ("off", "stuck", "wrong", "intermittent"),
-    "cameras": ("off", "stuck", "garbage", "intermittent"),
-    "left_camera": ("off", "stuck", "garbage", "intermittent"),
-    "right_camera": ("off", "stuck", "garbage", "intermittent"),
+    **dict.fromkeys(("cameras", "left_camera", "right_camera"), ("off", "stuck", "garbage", "intermittent")),
     "lamp": ("off", "intermittent"),
-    "pressure": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
-    "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
-    "dvl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
-    "usbl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    **dict.fromkeys(SENSORS, ("off", "stuck", "wrong", "garbage", "intermittent", "delayed")),
     "tether": ("stuck",),
     "water": ("silt", "gust"),
     "fish": ("school",),

@@ -118,14 +118,10 @@ class Flight:
     def step(self, command: Array, pace: Pace = FULL, keyframe: bool | None = None) -> Frame | None:
         """Moves the vehicle for one frame interval and returns the next frame; None after the last frame of the plan.
 
-        Args:
-            command: (n,) thruster commands in [-1, 1], or velocity (3,) in the world [m/s] of a kinematic vehicle.
-            pace: pace along the planned path from this frame to the next; no effect during station keeping.
-            keyframe: whether the next frame is a keyframe, with both images; None: as planned.
-
-        Raises:
-            RuntimeError: an earlier call returned None.
-            SurveyAborted: the command is not finite, or the physics diverged.
+        The commands (n,) of the thrusters are in [-1, 1], or the velocity (3,) in the world [m/s] of a kinematic
+        vehicle; `pace` has no effect during station keeping; the next frame is a keyframe, with both images, as planned
+        or as given. Raises SurveyAborted if the command is not finite, or the physics diverged, and RuntimeError if an
+        earlier call returned None.
         """
         if self._k == len(self._sequence):
             raise RuntimeError("all frames of the plan have been flown; reset starts another flight")
