@@ -68,7 +68,7 @@ MUTANTS = [
         ("twin/world/floor_following.py", "np.cos(angle) + gradient * np.sin(angle)", "np.cos(angle) - gradient * np.sin(angle)", "world_floor_following"),
         ("twin/world/floor_following.py", "sampled(top_m, x, y, 0) + self._clearance_m", "sampled(top_m, x, y, 0) - self._clearance_m", "world_floor_following"),
         ("twin/world/gap_filling.py", "self._asked & (self._n < _LEAST_KEYFRAMES)", "self._asked & (self._n < 1)", "world_gap_filling"),
-        ("twin/world/chart.py", "np.float32(t.prior_offset_m)", "np.float32(-t.prior_offset_m)", "world_floor_following"),
+        ("twin/world/height_floor.py", "np.float32(t.prior_offset_m)", "np.float32(-t.prior_offset_m)", "world_floor_following"),
         ("controllers/survey_plan.py", "per_px = self.altitude_m / self.focal_px", "per_px = self.altitude_m * 2 / self.focal_px", "controllers_lawnmower"),
         # scenes
         ("scenes/builder.py", "mass_kg, np.zeros(3), np.array(inertia_kgm2)", "mass_kg, np.ones(3), np.array(inertia_kgm2)", "scenes_builder"),

@@ -32,9 +32,8 @@ from twin.simulate.sea import make_sea, mean_current_mps
 from twin.simulate.sensors import imu_rate_hz
 from twin.simulate.tether import tether_of
 from twin.terrains.objects.placed_object import PlacedObject
-from twin.world.chart import chart_of
 from twin.world.computer import check_computer
-from twin.world.height_floor import load_terrain
+from twin.world.height_floor import chart_of, load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
 from twin.world.pace import SAME_TIME_S, Pace
