@@ -35,11 +35,9 @@ def pseudo_inverse_allocation(configuration: Array, thrust_of_command: Callable[
     """Returns the allocation by the pseudo-inverse of the thrust configuration matrix.
 
     The thrusts f = B' (B B')^-1 tau minimise f' f subject to B f = tau (Fossen 2011, section 12.3). Where the thrusters
-    cannot produce all wrenches, they produce the part of tau that they can (generalised inverse).
-
-    Args:
-        configuration: thrust configuration matrix B (6, n): wrench [moment, force] in the body per newton of thrust.
-        thrust_of_command: returns the steady thrust [N] at commands in [-1, 1], increasing around 0.
+    cannot produce all wrenches, they produce the part of tau that they can (generalised inverse). B (6, n) is the
+    wrench [moment, force] in the body per newton of thrust; `thrust_of_command` returns the steady thrust [N] at
+    commands in [-1, 1], increasing around 0.
     """
     square = configuration @ configuration.T
     is_full = np.linalg.matrix_rank(configuration) == 6

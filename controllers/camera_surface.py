@@ -69,15 +69,9 @@ def surface_above_floor(
 
     The floor is averaged twice over the footprint, along u and v, and sampled at nodes about 1/8 of the shorter side of
     the footprint apart, but not closer than `spacing_m`. Around steep parts it is raised, by as little as possible,
-    until its slope is at most `max_slope`; a Gaussian filter of one node distance then rounds the edges.
-
-    Args:
-        height_at: height of the floor [m] at arrays x and y [m], also around the terrain.
-        spacing_m: distance between the samples of the floor.
-        footprint_m: extent of an image on the floor along u and v.
-        max_slope: greatest slope (rise over run) of the surface along u, which is that of paths at cruise speed, and
-            along v.
-        least_at: least height of the camera [m] at arrays x and y [m], to which the surface is raised; None: none.
+    until its slope (rise over run) along u and v is at most `max_slope`, along u that of paths at cruise speed, and to
+    the least height of the camera, `least_at`; a Gaussian filter of one node distance then rounds the edges. Both
+    functions return heights [m] at arrays x and y [m], also around the terrain.
     """
     reach_m = np.array(area.size_m) / 2 + footprint_m
     step_m = max(min(spacing_m, min(footprint_m) / _NODES), float(np.sqrt(4 * reach_m.prod() / _MOST_SAMPLES)))

@@ -123,7 +123,8 @@ def _detour(plan: SurveyPlan, leave: _Break, task: Task) -> tuple[tuple[Segment,
     )  # fmt: skip
     planned = lawnmower.plan(close)
     legs = [_raised(segment, task.floor_m) for path in planned.paths for segment in path]
-    first, final = _start_of(legs), end_of(legs)
+    (start_x, start_y, start_z), final = legs[0].points()[0].tolist(), end_of(legs)
+    first = start_x, start_y, start_z
     above = [(point[0], point[1], z) for point in (first, final)]
     there = _joined(request, [(x, y, z), above[0]], plan.speed_mps, yaw)
     back = _joined(request, [above[1], (x, y, z)], plan.speed_mps, yaw)
@@ -135,11 +136,6 @@ def _raised(segment: Segment, by_m: float) -> Segment:
     assert isinstance(segment, Line)  # a lawnmower that reverses
     x, y, z = segment.start
     return segment._replace(start=(x, y, z + by_m))
-
-
-def _start_of(path: Sequence[Segment]) -> Point:
-    x, y, z = path[0].points()[0].tolist()
-    return x, y, z
 
 
 def _joined(request: SurveyRequest, points: Sequence[Point], speed_mps: float, yaw: float) -> list[Line]:

@@ -17,13 +17,10 @@ _CURRENT_S = 6.0  # time constant of the estimate of the current; at first, that
 class FinAutopilot:
     """Autopilot with its state: integrals of the position error, and the estimate of the current across the bow.
 
-    Args:
-        curvatures: (k,) of circles, increasing, positive to the left [1/m].
-        trims: (k, 9 + n) on them, at the cruise speed: roll, pitch, yaw minus course [rad], [angular, linear] velocity
-            in body axes, inputs.
-        gains: (n, 15) feedback gains K of the errors of position along the course, to its left and up, of roll, pitch,
-            yaw, twist, and of the integrals of the position errors.
-        most: (n,) greatest inputs, thrusts [N] and then angles of fins [rad]; backwards the same.
+    The trims (k, 9 + n) are those at the cruise speed on circles of the curvatures (k,), increasing, positive to the
+    left [1/m]: roll, pitch, yaw minus course [rad], [angular, linear] velocity in body axes, inputs. The gains K (n,
+    15) are of the errors of position along the course, to its left and up, of roll, pitch, yaw, twist, and of the
+    integrals of the position errors. `most` (n,) are the greatest thrusts [N] and then angles of fins [rad].
     """
 
     def __init__(self, curvatures: Array, trims: Array, gains: Array, most: Array, speed_mps: float, period_s: float):
@@ -34,12 +31,9 @@ class FinAutopilot:
     def inputs(
         self, pose: Array, twist: Array, position: Array, velocity: Array, acceleration: Array, is_measured: bool
     ) -> Array:
-        """Returns the inputs (n,) for one period, and updates the state.
+        """Returns the inputs (n,) for one period, and updates the state, as `tracking.control_thrusters` does.
 
-        Args:
-            pose, twist: estimated pose world_from_body (4, 4), and [angular, linear] velocity (6,) in the body.
-            position, velocity, acceleration: `Reference` of the body in the world.
-            is_measured: whether the motion was measured; else integrals and current are kept.
+        Unless the motion was measured, integrals and current are kept.
         """
         through, course = velocity[:2] - self._current, np.arctan2(velocity[1], velocity[0])
         speed = float(np.hypot(*through))

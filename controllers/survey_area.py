@@ -108,14 +108,10 @@ class SurveyArea:
 def polygons_area(polygons_m: Sequence[Sequence[ArrayLike]], heading: float) -> SurveyArea:
     """Returns the area of polygons in the scene [m], with legs along the heading [rad, counter-clockwise from east].
 
-    Args:
-        polygons_m: for each polygon, the corners (n, 2) of its outline and of its holes, in either sense; the first may
-            be repeated at the end. Polygons may touch or overlap.
-
-    Raises:
-        TwinError: a ring has fewer than three corners, or all together more than MAX_CORNERS; a coordinate is not
-            finite; two edges of a polygon intersect, or a hole lies outside it; or the extent along or across the legs
-            is less than MIN_SIZE_M.
+    Each has the corners (n, 2) of its outline and of its holes, in either sense; the first may be repeated at the end.
+    Polygons may touch or overlap. Raises TwinError if a ring has fewer than three corners, or all together more than
+    MAX_CORNERS; a coordinate is not finite; two edges of a polygon intersect, or a hole lies outside it; or the extent
+    along or across the legs is less than MIN_SIZE_M.
     """
     rings = _united([[_ring(corners) for corners in polygon] for polygon in polygons_m])
     legs = SurveyArea("polygon", (0.0, 0.0), heading=heading)

@@ -21,10 +21,7 @@ class ThrusterMonitor:
     """Compares the thrust that speed controllers (ESCs) report with that of the commands, frame by frame.
 
     A thruster that misses too much of its thrust is lost for the rest of the survey: without commands, nothing shows
-    that it works again. The RMS are exponentially weighted over the last second.
-
-    Args:
-        full_n: full thrust of a thruster [N].
+    that it works again. The RMS are exponentially weighted over the last second; `full_n` is the full thrust of one.
     """
 
     def __init__(self, full_n: float, rate_hz: float):

@@ -88,12 +88,8 @@ def control_thrusters(controller, pose, twist, position, velocity, acceleration,
     """Returns the thruster commands (n,) in [-1, 1] for one period, and updates the integral action in place.
 
     PID control of position and level attitude, with feed-forward of acceleration and of the drag in the estimated
-    current.
-
-    Args:
-        pose, twist: estimated pose world_from_body (4, 4), and [angular, linear] velocity (6,) in the body.
-        position, velocity, acceleration, yaw: `Reference` of the body in the world.
-        is_measured: whether the motion was measured; else the estimate of the current is kept.
+    current, which is kept unless the motion was measured. From the estimated pose world_from_body (4, 4) and [angular,
+    linear] velocity (6,) in the body to the `Reference` of the body in the world.
     """
     if is_measured:
         update_current(controller.flow, controller.hull, pose, twist, controller.period_s)

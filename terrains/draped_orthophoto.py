@@ -32,15 +32,11 @@ def lay_orthophoto(
     """Replaces the texture of a floor by an orthophoto where it has valid pixels; returns whether it covers each texel.
 
     It is transformed to the CRS of the DEM; without a CRS, it is taken to be in that one. If more than 1.5 of its
-    pixels fit along the side of a texel, they are averaged over the texel, else interpolated.
+    pixels fit along the side of a texel, they are averaged over the texel, else interpolated. The texture (rows, cols,
+    3), row 0 = north, is changed in place; the centre of its extent along x and y is the origin of the scene.
 
-    Args:
-        texture: (rows, cols, 3) uint8 RGB, row 0 = north, changed in place.
-        extent_m: extent of the floor along x and y; its centre is the origin of the scene.
-        georeference: position of the scene in the CRS of the DEM; None if the DEM has no coordinates.
-    Raises:
-        TwinError: the DEM has no coordinates, or no CRS although the orthophoto has one; or the orthophoto is missing,
-            invalid or too large, has no coordinates, or does not overlap the DEM.
+    Raises TwinError if the DEM has no coordinates (`georeference` None), or no CRS although the orthophoto has one; or
+    the orthophoto is missing, invalid or too large, has no coordinates, or does not overlap the DEM.
     """
     if georeference is None:
         raise _error(file, "cannot be placed: the DEM has no coordinates",

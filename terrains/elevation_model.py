@@ -32,10 +32,8 @@ _EQUATOR_M, _ECCENTRICITY2 = 6_378_137.0, 0.00669438  #: ellipsoid WGS 84
 def read_raster_heights(file: Path, height_spacing_m: float, driver: str = "GTiff") -> HeightFile:
     """Reads a raster with one band of heights, and possibly an alpha band, which is 0 where there is no height.
 
-    The grid spacing is `height_spacing_m` without coordinates.
-
-    Raises:
-        TwinError: the file cannot be read, is an image or too large, or its grid or unit of height is not supported.
+    The grid spacing is `height_spacing_m` without coordinates. Raises TwinError if the file cannot be read, is an image
+    or too large, or its grid or unit of height is not supported.
     """
     with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS, [driver]) as source:
         if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):

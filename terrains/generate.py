@@ -43,14 +43,10 @@ def generate_from(
 ) -> Terrain:  # fmt: skip
     """Returns a terrain centred at the origin, with heights from a function and a generated texture.
 
-    Args:
-        heights: returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the nodes [m], given a random generator.
-        size_m: extent along x and y; rounded up to whole cells.
-        texture: side of a texel and texture of walls; its files are not used.
-        cover: a key of `ground_cover.COVERS`.
-        seed: seed of the heights and the texture.
-    Raises:
-        TwinError: the cover is unknown, or the terrain is too large for memory.
+    The function returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the nodes [m], given a random generator. The
+    extent along x and y is rounded up to whole cells; `cover` is a key of `ground_cover.COVERS`, and `texture` has the
+    side of a texel and the texture of walls, its files are not used. Raises TwinError if the cover is unknown, or the
+    terrain is too large for memory.
     """
     nx, ny = (max(1, int(np.ceil(extent / grid_m - 1e-6))) + 1 for extent in size_m)
     shape = texture_shape((ny, nx), grid_m, texture.texel_m(((nx - 1) * grid_m, (ny - 1) * grid_m)))

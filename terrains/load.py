@@ -11,8 +11,7 @@ from twin.core.user_files import reading
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, decoded, height_error
 from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
-from twin.terrains.input_statement import InputStatement
-from twin.terrains.terrain import Terrain, texture_shape
+from twin.terrains.terrain import InputStatement, Terrain, texture_shape
 from twin.terrains.textures import TextureSource, generate_texture, texture_from_photo
 from twin.terrains.vertical_axis import Direction, HeightFile, VerticalAxis, direction_of
 from twin.terrains.walls import walls_of
@@ -35,15 +34,10 @@ def load(
 ) -> Terrain:  # fmt: skip
     """Reads a terrain, fills its holes, centres it at the origin and moves its lowest point to z = 0.
 
-    Args:
-        height_file: file of heights, row 0 = north. A height belongs to the centre of its raster cell, so the terrain
-            is one cell smaller than the raster in both directions.
-        height_spacing_m: grid spacing if the file does not contain one (PNG, .npy, TIFF without georeference).
-        height_range_m: height difference between white and black in a PNG.
-        seed: seed of the texture if it is generated.
-        z: direction in which the values of the file increase; None: determined from the file.
-    Raises:
-        TwinError: a file is missing, invalid or too large, the direction of heights unclear, or the cover unknown.
+    A height belongs to the centre of its raster cell, so the terrain is one cell smaller than the raster in both
+    directions. `height_spacing_m` is for files without a grid spacing, `height_range_m` between white and black for a
+    PNG, and `seed` for a generated texture; without `z`, the direction of the values is determined from the file.
+    Raises TwinError if a file is missing, invalid or too large, the direction unclear, or the cover unknown.
     """
     file = Path(height_file)
     given = _read_heights(file, height_spacing_m, height_range_m)

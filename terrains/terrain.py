@@ -9,7 +9,27 @@ from numpy.typing import ArrayLike, NDArray
 from twin.core.geometry import Array
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
-from twin.terrains.input_statement import InputStatement
+
+
+class InputStatement(NamedTuple):
+    """Interpretation of the files of a floor; evidence is a key of the scenario, a part of the file, or assumed."""
+
+    file: str  #: name of the file of the floor
+    crs: str  #: as `HeightFile.crs`
+    ground_scale: float | None  #: as `HeightFile.ground_scale`
+    spacing_m: float  #: distance between the nodes of the height grid
+    spacing_evidence: str
+    metres_per_unit: float  #: length of the unit of the values
+    unit_evidence: str
+    direction: str  #: "up" or "down", the direction in which the values of the file increase
+    direction_evidence: str
+    least: float  #: least and greatest value of the file, in its unit
+    greatest: float
+    nodata: str  #: as `HeightFile.nodata`
+    share_without_height: float  #: share of the nodes of the height grid that have no height in the file
+    texture: str  #: origin of the colours
+    doubts: tuple[str, ...] = ()  #: as `HeightFile.doubts`
+
 
 Index = NDArray[np.int64]
 
@@ -42,36 +62,24 @@ class Terrain:
     """Seafloor over a rectangle with its south-west corner at (west_m, south_m); x east, y north, z up [m].
 
     The height is linear on the two triangles of each cell, split along the diagonal from node (r, c) to (r + 1, c + 1).
-
-    Args:
-        height_m: (ny, nx) float32 heights of the grid nodes; row 0 = SOUTH, column 0 = west. The outermost nodes lie on
-            the edges of the rectangle.
-        spacing_m: distance between neighbouring nodes along x and y.
-        west_m, south_m: position of node (0, 0).
-        texture: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH.
-        texture_px_m: side of a texel along x; along y, it may differ by rounding.
-        filled: (ny, nx) bool, nodes without a height in the source, which have the nearest height, for rendering; None:
-            no node.
-        georeference: position of the scene in the CRS of the source; None for a floor without coordinates.
-        orthophoto_share: share of the texels that an orthophoto covers; None without an orthophoto.
-        walls: texture of the steep parts; None: the texture is projected from above everywhere.
-        known: (ny, nx) bool, nodes with a height in the source or in a small hole of it (`holes.known_nodes`); only
-            over these is a survey planned and judged. None: all nodes.
-        stated: how the files of the floor were read; None for a generated floor.
     """
 
+    #: (ny, nx) float32 heights of the grid nodes, the outermost on the edges; row 0 = SOUTH, column 0 = west
     height_m: NDArray[np.float32]
-    spacing_m: float
-    west_m: float
+    spacing_m: float  #: distance between neighbouring nodes along x and y
+    west_m: float  #: position of node (0, 0), as `south_m`
     south_m: float
-    texture: NDArray[np.uint8]
-    texture_px_m: float
+    texture: NDArray[np.uint8]  #: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH
+    texture_px_m: float  #: side of a texel along x; along y, it may differ by rounding
+    #: (ny, nx) bool, nodes without a height in the source, which have the nearest height, for rendering; None: no node
     filled: NDArray[np.bool_] | None = None
-    georeference: Georeference | None = None
-    orthophoto_share: float | None = None
-    walls: Walls | None = None
+    georeference: Georeference | None = None  #: of the scene in the CRS of the source; None without coordinates
+    orthophoto_share: float | None = None  #: share of the texels that an orthophoto covers; None without one
+    walls: Walls | None = None  #: texture of the steep parts; None: the texture is projected from above everywhere
+    #: (ny, nx) bool, nodes with a height in the source or in a small hole of it (`holes.known_nodes`); only over these
+    #: is a survey planned and judged. None: all nodes.
     known: NDArray[np.bool_] | None = None
-    stated: InputStatement | None = None
+    stated: InputStatement | None = None  #: how the files of the floor were read; None for a generated floor
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -25,13 +25,11 @@ def walls_of(
     height_m: NDArray[np.float32], spacing_m: float, source: TextureSource, cover: str, texel_m: float,
     rng: np.random.Generator, draped: Mask | None = None,
 ) -> Walls | None:  # fmt: skip
-    """Returns the walls of a floor; None if `source.walls` is false or no part of the floor is steep.
+    """Returns the walls of a floor of heights (ny, nx), row 0 = south; None if it has none, or no part is steep.
 
-    Args:
-        height_m: (ny, nx) heights, row 0 = south.
-        cover: a key of `ground_cover.COVERS`, for a floor without photo.
-        texel_m: side of the texels of the floor and, within WALL_TEXELS, of the walls.
-        draped: (rows, cols) texels, row 0 = north, that an orthophoto covers, where there are no walls.
+    `cover` is a key of `ground_cover.COVERS`, for a floor without photo, `texel_m` the side of the texels of the floor
+    and, within WALL_TEXELS, of the walls. An orthophoto covers the texels `draped` (rows, cols), row 0 = north, where
+    there are no walls.
     """
     found = wall_weights(height_m, spacing_m, draped) if source.walls else None
     if found is None:

@@ -64,11 +64,11 @@ MUTANTS = [
         ("twin/simulate/image_faults.py", "camera * rig.baseline_m * px_per_m", "0 * rig.baseline_m * px_per_m", "simulate_faults"),
         ("twin/estimate/vision/inertial_filter.py", "advance[9 + i, 12 + j] -= g[i, j]", "advance[9 + i, 12 + j] += g[i, j]", "estimate_inertial"),
         ("twin/estimate/vision/inertial_filter.py", "geometry.so3_exp(rate * (dt / 2)) @ force", "force", "estimate_inertial"),
-        ("twin/world/path_change.py", "slope, decay = self.rate_mps + w * self.left_m", "slope, decay = self.rate_mps - w * self.left_m", "world_floor_following"),
+        ("twin/world/mission_flight.py", "slope, decay = self.rate_mps + w * self.left_m", "slope, decay = self.rate_mps - w * self.left_m", "world_floor_following"),
         ("twin/world/floor_following.py", "np.cos(angle) + gradient * np.sin(angle)", "np.cos(angle) - gradient * np.sin(angle)", "world_floor_following"),
         ("twin/world/floor_following.py", "sampled(top_m, x, y, 0) + self._clearance_m", "sampled(top_m, x, y, 0) - self._clearance_m", "world_floor_following"),
         ("twin/world/gap_filling.py", "self._asked & (self._n < _LEAST_KEYFRAMES)", "self._asked & (self._n < 1)", "world_gap_filling"),
-        ("twin/world/chart.py", "np.float32(t.prior_offset_m)", "np.float32(-t.prior_offset_m)", "world_floor_following"),
+        ("twin/world/height_floor.py", "np.float32(t.prior_offset_m)", "np.float32(-t.prior_offset_m)", "world_floor_following"),
         ("controllers/survey_plan.py", "per_px = self.altitude_m / self.focal_px", "per_px = self.altitude_m * 2 / self.focal_px", "controllers_lawnmower"),
         # scenes
         ("scenes/builder.py", "mass_kg, np.zeros(3), np.array(inertia_kgm2)", "mass_kg, np.ones(3), np.array(inertia_kgm2)", "scenes_builder"),
@@ -141,7 +141,7 @@ MUTANTS = [
         # exchange
         ("twin/datasets/ros2/bag_writer.py", "return air_pa + PASCAL_PER_METRE * (surface_m - height_m)", "return air_pa + PASCAL_PER_METRE * (height_m - surface_m)", "exchange_ros2"),
         ("twin/exchange/geotiff.py", "cell = grid.cell_m / origin.metres_per_unit", "cell = grid.cell_m * origin.metres_per_unit", "world_placement"),
-        ("twin/exports/attitude.py", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(roll)), float(np.rad2deg(pitch))", "exchange_datasets"),
+        ("twin/exports/geographic_place.py", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(roll)), float(np.rad2deg(pitch))", "exchange_datasets"),
         # plug-ins, world, surrogate, sessions
         ("twin/plugin/guard.py", "max(error, turned) > _ROTATION_TOLERANCE", "error > _ROTATION_TOLERANCE", "plugin_guard"),
         ("twin/plugin/guard.py", "function(*copy.deepcopy(arguments))", "function(*arguments)", "plugin_guard"),

@@ -24,9 +24,9 @@ from twin.datasets.run_contents import ImuNoise, RecordedFrame, RecordedImu, Run
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exports import ifdo, metashape, nerfstudio
-from twin.exports.attitude import yaw_pitch_roll_deg
 from twin.exports.camera_models import true_calibration
 from twin.exports.formats import FORMATS, check_needs, chosen_formats
+from twin.exports.geographic_place import yaw_pitch_roll_deg
 from twin.recordings.opened_dataset import ReplayOptions
 from twin.recordings.rectification import rectification
 from twin.scenario.model import Scenario

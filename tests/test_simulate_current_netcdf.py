@@ -184,7 +184,7 @@ def test_a_file_of_another_form_is_refused_in_one_line(tmp_path, change, keys, p
 
 
 def test_a_table_of_too_many_values_is_refused_before_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("twin.simulate.current_netcdf._MOST_VALUES", 11)
+    monkeypatch.setattr("twin.simulate.current_file._MOST_VALUES", 11)
     with pytest.raises(TwinError, match="u has .*'time': 3, 'lev': 4"):
         sea_of(written(model_of(places=False), tmp_path))
 

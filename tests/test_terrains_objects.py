@@ -19,7 +19,7 @@ from twin.terrains.objects import built_models, mesh_file, scattering
 from twin.terrains.objects.coloured_mesh import Mesh, with_colours
 from twin.terrains.objects.detail import levels_of
 from twin.terrains.objects.floor_mesh import tiles_of
-from twin.terrains.objects.mesh_header import face_count
+from twin.terrains.objects.mesh_file import face_count
 from twin.terrains.objects.placed_object import model_of
 from twin.terrains.objects.shapes import SHAPES, build_shape
 from twin.world.objects import load_objects

@@ -13,7 +13,7 @@ from twin.scenario.file import load_scenario
 from twin.simulate.echo_sounders import Altimeter
 from twin.world.floor_following import EchoCorrection, FloorFollower
 from twin.world.mission import prepare
-from twin.world.path_change import PathChange
+from twin.world.mission_flight import PathChange
 from twin.world.planning import floor_of, smoothed_over
 
 HILLS = ["terrain.kind=fractal", "terrain.relief_m=1.2", "terrain.size_m=[12.0, 10.0]", "plan.area_m=[5.0, 3.0]",

@@ -35,7 +35,10 @@ class _SurveyEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """What both environments share: the world, the action and the target of the controller."""
 
     def __init__(self, given: Scenario, action: str):
-        _check_action(given, action)
+        if action not in ("velocity", "thrust") or (action == "thrust" and given.vehicle.dynamics != "rigid"):
+            raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
+        if action == "velocity" and given.vehicle.is_steered_by_fins:
+            raise TwinError("action", f"{action!r}: not for a vehicle that is steered by fins", '"thrust"')
         self.world, self._velocity_action = SteppedWorld(given), action == "velocity"
         self._most_mps = SPEED_RATIO * given.plan.speed_mps
         n = 4 if self._velocity_action else given.vehicle.n_commands
@@ -65,10 +68,25 @@ class _SurveyEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _seen_by_controller(self) -> Estimate:
         raise NotImplementedError
 
-    def _departure(self) -> str:
-        """Returns the reason for the end of the episode if the camera is outside of the terrain, otherwise ""."""
+    def _fly(self, action: NDArray[np.float32], n_frames: int, ends_at_keyframe: bool) -> tuple[str, bool]:
+        """Applies an action for some frames; returns why the episode ends, or "", and whether the plan is flown."""
+        values, is_over = np.clip(np.asarray(action, np.float64), -1.0, 1.0), False
+        try:
+            for k in range(n_frames):
+                keyframe = k + 1 == n_frames if ends_at_keyframe else None
+                frame = self.world.step(self._command(values), keyframe=keyframe)
+                if is_over := frame is None:
+                    break
+                self._frame = frame
+                self._perceive()
+        except SurveyAborted as error:
+            return str(error), False
         x, y = self.world.true_pose[:2, 3]
-        return "the camera left the terrain" if np.isnan(self.world.mission.terrain.height_at(x, y)) else ""
+        has_left = np.isnan(self.world.mission.terrain.height_at(x, y))
+        return "the camera left the terrain" if has_left else "", is_over
+
+    def _perceive(self) -> None:
+        """Passes a frame to what the environment has of estimators."""
 
 
 class SeabedTwinEnv(_SurveyEnv):
@@ -160,25 +178,17 @@ class SeabedTwinEnv(_SurveyEnv):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Applies an action up to the next keyframe; returns observation, reward, terminated, truncated and info."""
-        values = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
-        truncated = False
-        try:
-            for k in range(self.frames_per_step):
-                frame = self.world.step(self._command(values), keyframe=k + 1 == self.frames_per_step)
-                if frame is None:
-                    truncated = True
-                    break
-                self._frame = frame
-                if self.world.aligns:
-                    self._navigator.align_track(self.world.track)
-                self._estimate = self._navigator.update(frame, self.world.track)
-        except SurveyAborted as error:
-            self._ended = str(error)
-        self._ended = self._ended or self._departure()
+        ended, truncated = self._fly(action, self.frames_per_step, ends_at_keyframe=True)
+        self._ended = self._ended or ended
         seen_m2 = self._seen_m2()
         gained_m2, self._covered_m2 = seen_m2 - self._covered_m2, seen_m2
         reward = gained_m2 if self._reward == "coverage" else -self.distance_m
         return self._observation(), reward, bool(self._ended), truncated, self._info()
+
+    def _perceive(self) -> None:
+        if self.world.aligns:
+            self._navigator.align_track(self.world.track)
+        self._estimate = self._navigator.update(self._frame, self.world.track)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Returns the stereo pair side by side (H, 2 W, 3); None unless the render mode is "rgb_array"."""
@@ -276,16 +286,7 @@ class SeabedTwinStateEnv(_SurveyEnv):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Applies an action for `frames` frames; returns observation, reward, terminated, truncated and info."""
-        values, ended, truncated = np.clip(np.asarray(action, np.float64), -1.0, 1.0), "", False
-        try:
-            for _ in range(self._frames):
-                frame = self.world.step(self._command(values))
-                if truncated := frame is None:
-                    break
-                self._frame = frame
-        except SurveyAborted as error:
-            ended = str(error)
-        ended = ended or self._departure()
+        ended, truncated = self._fly(action, self._frames, ends_at_keyframe=False)
         reward = self._reward(self) if callable(self._reward) else -self.distance_m
         return self._observation(), reward, bool(ended), truncated, {"time_s": self._frame.time_s, "ended": ended}
 
@@ -323,13 +324,6 @@ def moved(last: Reference, values: Array, most_mps: float, interval_s: float) ->
     forward, left, up = values[:3] * most_mps
     velocity = np.array([c * forward - s * left, s * forward + c * left, up])
     return Reference(last.position + velocity * interval_s, velocity, yaw, np.zeros(3))
-
-
-def _check_action(scenario: Scenario, action: str) -> None:
-    if action not in ("velocity", "thrust") or (action == "thrust" and scenario.vehicle.dynamics != "rigid"):
-        raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
-    if action == "velocity" and scenario.vehicle.is_steered_by_fins:
-        raise TwinError("action", f"{action!r}: not for a vehicle that is steered by fins", '"thrust"')
 
 
 def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:

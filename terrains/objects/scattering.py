@@ -28,15 +28,10 @@ def place(
     number: int, group: ObjectConfig, models: Sequence[ObjectModel], terrain: Terrain,
     taken: Sequence[PlacedObject], seed: int,
 ) -> list[PlacedObject]:  # fmt: skip
-    """Returns the objects of an entry of `[[objects]]`.
+    """Returns the objects of an entry of `[[objects]]` by its number, from 0; each has one of the models as its shape.
 
-    Args:
-        number: number of the entry, from 0.
-        models: shapes, of which each object has one.
-        taken: objects of other entries, which scattered objects do not overlap.
-    Raises:
-        TwinError: an object with a given position reaches beyond the terrain; there would be no scattered object or too
-            many, or they do not fit.
+    Scattered objects do not overlap those of other entries, `taken`. Raises TwinError if an object with a given
+    position reaches beyond the terrain; there would be no scattered object or too many, or they do not fit.
     """
     entry = _Entry(number, group, terrain, np.random.default_rng(np.random.SeedSequence([seed, number])))
     if group.position_m is None:

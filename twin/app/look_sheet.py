@@ -104,12 +104,11 @@ def _light(
     image = "in the image" if linear else "in the image\nbefore tone curve and white balance"
     if 0.5 < exposed <= 1:
         return Panel(title, unit, layer, layer * gain, f"as bright as {image}")
-    note = f"{_factor(1 / exposed)} as bright as {image}" if gain else f"white = {_short(top)} {unit}"
+    note = f"white = {_short(top)} {unit}"
+    if gain:
+        factor = f"{1 / exposed:.2g}" if exposed > 0.01 else f"{round(1 / exposed, -2):.0f}"
+        note = f"{factor} times as bright as {image}"
     return Panel(title, unit, layer, layer / top, note)
-
-
-def _factor(value: float) -> str:
-    return f"{value:.2g} times" if value < 100 else f"{round(value, -2):.0f} times"
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:

@@ -26,7 +26,7 @@ def new_folder(folder: Path, option: str = "--out", used: bool = False) -> Path:
 def unused_folder(first: Path) -> Path:
     """Returns the first of FOLDER, FOLDER-2, FOLDER-3, ... that is new or empty, checked by `new_folder`."""
     folder, count = first, 1
-    while folder.exists() and not _is_empty(folder):
+    while folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         count += 1
         folder = first.with_name(f"{first.name}-{count}")
     return new_folder(folder)
@@ -76,10 +76,6 @@ def file_stem(name: str) -> str:
 
 def path_stem(path: Path) -> str:
     return file_stem(resolved(path).name)
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
 
 
 def _check_writable(path: Path, option: str) -> None:

@@ -30,12 +30,8 @@ _WHOLE = "an unedited run folder, or a new one"
 class Checkpoints:
     """Checkpoints in the folder `checkpoint` of a run: its last state, and a manifest, which is replaced after it.
 
-    Args:
-        run: the run folder.
-        identity: texts, by name, on which the results of the run depend: a state is of a run with the same ones.
-        inputs: files that the run reads, for the same purpose.
-        interval_s: wall time between checkpoints [s]; 0: none are saved; None: `DEFAULT_S`, or so much that they take
-            1 % of the time.
+    A state is of a run with the same `identity`, texts by name, and the same input files. The wall time between
+    checkpoints is `interval_s`; 0: none are saved; None: `DEFAULT_S`, or so much that they take 1 % of the time.
     """
 
     def __init__(self, run: Path, identity: Mapping[str, str], inputs: Iterable[Path], interval_s: float | None):
@@ -51,12 +47,9 @@ class Checkpoints:
     def open(self, resume: bool, made_anew: Sequence[object] = ()) -> Any:
         """Returns the last state if the run is to be resumed; None if it begins, or was killed before the first one.
 
-        Args:
-            made_anew: objects that a state leaves out; they are the same, in the same order, in every process.
-
-        Raises:
-            TwinError: manifest, state or a file on which the state depends was edited or is damaged, or they belong to
-                another run or program, or the folder has other contents and no checkpoint.
+        A state leaves out the objects `made_anew`; they are the same, in the same order, in every process. Raises
+        TwinError if manifest, state or a file on which the state depends was edited or is damaged, or they belong to
+        another run or program, or the folder has other contents and no checkpoint.
         """
         self._made_anew = made_anew
         if not (resume or self._interval_s):

@@ -16,14 +16,10 @@ class StageGuard:
 
     One that arrives between two stages is delivered at the start of the second, to the handler installed when the
     context was entered. Signals without a Python handler, and threads other than the main one, are not affected.
-
-    Attributes:
-        cause: why the survey is aborted, set by the caller; "" if there is no such cause.
-        skipped: names of the stages that an interrupt ended.
     """
 
     def __init__(self) -> None:
-        self.cause, self.skipped = "", list[str]()
+        self.cause, self.skipped = "", list[str]()  # why the caller aborts the survey; names of stages that were ended
         self._open, self._waiting = False, list[int]()
         self._handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
 

@@ -51,8 +51,25 @@ _LINK = np.dtype(
 _NOT_COMPUTED = np.full((4, 4), np.nan)
 
 
+def _column(name: str) -> Any:
+    def values(links: "Links") -> NDArray[Any]:
+        return links.table[name]
+
+    return property(values)
+
+
 class Links(Sequence[Link]):
-    """Sequence of links stored as a structured array, for vectorised access."""
+    """Sequence of links stored as a structured array, for vectorised access to the fields of all links (n, ...)."""
+
+    i: NDArray[np.int64] = _column("i")
+    j: NDArray[np.int64] = _column("j")
+    i_from_j: Array = _column("i_from_j")
+    information: Array = _column("information")
+    n_points: NDArray[np.int64] = _column("n_points")
+    shared_by: Array = _column("shared_by")
+    by_yaw: Array = _column("by_yaw")  #: zeros where it is not known
+    yaw_rad: Array = _column("yaw_rad")
+    by_image_errors: NDArray[np.float32] = _column("by_image_errors")  #: zeros where it is not known
 
     def __init__(self, links: Iterable[Link] = ()):
         self._rows = GrowingArray(dtype=_LINK)
@@ -70,7 +87,7 @@ class Links(Sequence[Link]):
         if mask.all():
             return self
         selected = Links()
-        selected._rows = GrowingArray.wrap(self._table[mask])
+        selected._rows = GrowingArray.wrap(self.table[mask])
         return selected
 
     def __len__(self) -> int:
@@ -85,23 +102,11 @@ class Links(Sequence[Link]):
     def __getitem__(self, k: int | slice) -> Link | list[Link]:
         if isinstance(k, slice):
             return [self[index] for index in range(*k.indices(len(self)))]
-        i, j, i_from_j, information, overlap, n_points, shared_by, form, by_yaw, yaw_rad, by_errors = self._table[k]
+        i, j, i_from_j, information, overlap, n_points, shared_by, form, by_yaw, yaw_rad, by_errors = self.table[k]
         numbers = float(overlap), int(n_points), float(shared_by)
         cov = symmetric_inverses(information[None])[0]
         form = None if np.isnan(form[0, 0]) else form
         return Link(int(i), int(j), i_from_j, cov, *numbers, form, by_yaw, float(yaw_rad), by_errors)
-
-    @property
-    def i(self) -> NDArray[np.int64]:
-        return self._table["i"]
-
-    @property
-    def j(self) -> NDArray[np.int64]:
-        return self._table["j"]
-
-    @property
-    def i_from_j(self) -> Array:
-        return self._table["i_from_j"]
 
     @property
     def cov(self) -> Array:
@@ -112,41 +117,14 @@ class Links(Sequence[Link]):
         return self.cov / self.shared_by[:, None, None]
 
     @property
-    def shared_by(self) -> Array:
-        return self._table["shared_by"]
-
-    @property
-    def information(self) -> Array:
-        return self._table["information"]
-
-    @property
-    def by_yaw(self) -> Array:
-        """Returns `Link.by_yaw` (n, 6); zeros where it is not known."""
-        return self._table["by_yaw"]
-
-    @property
-    def yaw_rad(self) -> Array:
-        """Returns `Link.yaw_rad` (n,)."""
-        return self._table["yaw_rad"]
-
-    @property
-    def by_image_errors(self) -> NDArray[np.float32]:
-        """Returns `Link.by_image_errors` (n, 6, 18); zeros where it is not known."""
-        return self._table["by_image_errors"]
-
-    @property
-    def n_points(self) -> NDArray[np.int64]:
-        return self._table["n_points"]
-
-    @property
     def by_closed_form(self) -> tuple[NDArray[np.bool_], Array]:
         """Returns the mask (n,) of the links that have a closed-form motion, and these motions (m, 4, 4)."""
-        forms = self._table["closed_form"]
+        forms = self.table["closed_form"]
         known = ~np.isnan(forms[:, 0, 0])
         return known, forms[known]
 
     @property
-    def _table(self) -> NDArray[Any]:
+    def table(self) -> NDArray[Any]:
         if self._pending:
             pending, self._pending = self._pending, []
             *columns, closed_forms, by_yaw, yaw_rad, by_image_errors, _ = zip(*pending, strict=True)

@@ -24,16 +24,8 @@ def sole_writer(folder: Path, option: str = "--out", used: bool = False, allowed
     """Creates a folder and locks it against other writers until the context ends.
 
     The operating system releases the lock when the process ends, in whatever way. Folders that were created here and
-    are empty at the end are removed.
-
-    Args:
-        option: field of the errors.
-        used: whether the folder may have contents.
-        allowed: what the error of a folder with contents allows.
-
-    Raises:
-        TwinError: another context holds the folder (the message names its process), it has contents and `used` is
-            False, or it cannot be written.
+    are empty at the end are removed. Raises TwinError with the field `option` if another context holds the folder (the
+    message names its process), it has contents and is not `used` (the error allows `allowed`), or it cannot be written.
     """
     check_folder(folder, option, used, allowed)
     created = [path for path in (folder, *folder.parents) if not path.exists()]

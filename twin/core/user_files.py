@@ -44,12 +44,8 @@ _ONE_FILE = "one file that contains them, as gdal_translate IN OUT writes it"
 def reading(file: Path, key: str = "", allowed: str = "", most_bytes: int = _MOST_BYTES) -> Iterator[None]:
     """Checks a file; within the context, any exception of its reader becomes a TwinError.
 
-    Args:
-        key: key of the scenario that names the file; "": the error names the file itself.
-        allowed: the files that are allowed, for the error.
-
-    Raises:
-        TwinError: the file is missing, not a regular file or too large, or its reader raised an exception.
+    So does a file that is missing, not a regular file or too large. The error names the key, of the scenario, or the
+    file itself for "", and the files that are allowed.
     """
     _check(file, key, allowed, most_bytes)
     try:

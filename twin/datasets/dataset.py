@@ -63,15 +63,10 @@ class Dataset:
 
 
 class Reader(Protocol):
-    """Reader of one layout of data sets; other packages register readers under the entry points `twin.readers`.
+    """Reader of one layout of data sets; other packages register readers under the entry points `twin.readers`."""
 
-    Attributes:
-        name: short name of the layout, for messages.
-        layout: description of the layout in a few words, for messages.
-    """
-
-    name: str
-    layout: str
+    name: str  #: short name of the layout, for messages
+    layout: str  #: its description in a few words, for messages
 
     def recognises(self, folder: Path) -> bool:
         """Returns whether a folder, or a file, has this layout."""

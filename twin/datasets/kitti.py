@@ -6,7 +6,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import StereoRig, Trajectory
+from twin.core.records import Trajectory
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.dataset import Dataset, StereoImages, value_or_error
 from twin.datasets.image_copy import copy_images
@@ -94,7 +94,11 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     folders, numbers = {"left": "image_2", "right": "image_3"}, {frame.index: k for k, frame in enumerate(pairs)}
     copy_images(contents, lambda camera, frame: sequence / folders[camera] / f"{numbers[frame.index]:06d}", pairs)
     (sequence / "times.txt").write_text("".join(f"{frame.time_s:.9f}\n" for frame in pairs), encoding="utf-8")
-    (sequence / "calib.txt").write_text(_calibration_text(contents.rig), encoding="utf-8")
+    rig = contents.rig
+    left, right = (np.column_stack([rig.matrix, [shift, 0, 0]]) for shift in (0, -rig.fx_px * rig.baseline_m))
+    projections = (" ".join(f"{value:.12e}" for value in p.ravel()) for p in (left, right, left, right))
+    text = "".join(f"P{k}: {projection}\n" for k, projection in enumerate(projections))
+    (sequence / "calib.txt").write_text(text, encoding="utf-8")
     if "truth" not in contents.trajectories:
         return [sequence]
     poses = contents.trajectories["truth"].world_from_camera[[frame.index for frame in pairs]]
@@ -103,10 +107,3 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     relative = geometry.inverse(poses[0]) @ poses
     np.savetxt(file, relative[:, :3].reshape(-1, 12), fmt="%.12e")
     return [sequence, file]
-
-
-def _calibration_text(rig: StereoRig) -> str:
-    left = np.column_stack([rig.matrix, np.zeros(3)])
-    right = np.column_stack([rig.matrix, [-rig.fx_px * rig.baseline_m, 0.0, 0.0]])
-    rows = [left, right, left, right]
-    return "".join(f"P{k}: " + " ".join(f"{value:.12e}" for value in p.ravel()) + "\n" for k, p in enumerate(rows))

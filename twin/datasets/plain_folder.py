@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.datasets.calibration import StereoCalibration
 from twin.datasets.calibration_files import find_calibration, read_calibration
 from twin.datasets.dataset import Dataset, StereoImages, value_or_error
 from twin.datasets.text_files import inside, read_table
@@ -35,14 +34,9 @@ class PlainFolderReader:
             for name, time_s in zip(names, times_s, strict=True)
             if name in left
         ]
-        calibration = value_or_error(lambda: _calibration(folder))
+        calibration = value_or_error(lambda: (file := find_calibration(folder)) and read_calibration(file))
         n_right_only = len(right.keys() - left.keys())
         return Dataset(folder, frames, calibration, None, n_right_only, notes, np.array(times_s))
-
-
-def _calibration(folder: Path) -> StereoCalibration | None:
-    file = find_calibration(folder)
-    return None if file is None else read_calibration(file)
 
 
 def image_files(folder: Path) -> dict[str, Path]:

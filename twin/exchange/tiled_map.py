@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from twin.core.records import ElevationMap, MapGrid
+from twin.core.templates import filled
 from twin.exchange import geotiff
 from twin.exchange.geotiff import LOCAL_METRES
 
 #: Layers of a tile and the types of their bands in a virtual raster.
 LAYERS = {"dem": ("Float32",), "dem_sigma": ("Float32",), "mosaic": ("Byte", "Byte", "Byte")}
-_COLOURS = ("Red", "Green", "Blue")
 
 
 class TiledMapFolder:
@@ -46,22 +46,8 @@ def _virtual_raster(layer: str, bands: tuple[str, ...], tiles: dict[str, MapGrid
     places = {name: (round((t.west_m - west) / cell), round((north - t.north_m) / cell)) for name, t in tiles.items()}
     width = max(places[name][0] + t.cols for name, t in tiles.items())
     height = max(places[name][1] + t.rows for name, t in tiles.items())
-    lines = [
-        f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">',
-        f"<SRS>{LOCAL_METRES.to_wkt().replace('&', '&amp;')}</SRS>",
-        f"<GeoTransform>{west!r}, {cell!r}, 0, {north!r}, 0, {-cell!r}</GeoTransform>",
-    ]
-    for band, kind in enumerate(bands, start=1):
-        lines.append(f'<VRTRasterBand dataType="{kind}" band="{band}">')
-        lines.append(f"<NoDataValue>{'nan' if kind == 'Float32' else 0}</NoDataValue>")
-        if len(bands) == len(_COLOURS):
-            lines.append(f"<ColorInterp>{_COLOURS[band - 1]}</ColorInterp>")
-        for name, (x, y) in places.items():
-            size = f'xSize="{tiles[name].cols}" ySize="{tiles[name].rows}"'
-            lines.append(
-                f'<SimpleSource><SourceFilename relativeToVRT="1">{layer}_{name}.tif</SourceFilename>'
-                f'<SourceBand>{band}</SourceBand><SrcRect xOff="0" yOff="0" {size}/>'
-                f'<DstRect xOff="{x}" yOff="{y}" {size}/></SimpleSource>'
-            )
-        lines.append("</VRTRasterBand>")
-    return "\n".join([*lines, "</VRTDataset>", ""])
+    context = {
+        "width": width, "height": height, "crs": LOCAL_METRES.to_wkt(), "west": west, "north": north, "cell": cell,
+        "bands": bands, "places": places, "tiles": tiles, "layer": layer,
+    }  # fmt: skip
+    return filled("twin.exchange", "virtual_raster.vrt.j2", context)

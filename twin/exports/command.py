@@ -51,16 +51,12 @@ def export(
     """Writes a run in several formats, each into the subfolder of `out` with the name of the format; returns the files.
 
     A subfolder appears when its format is complete; until then its files are in a hidden folder `.FORMAT.partial`,
-    which an error or an interrupt removes.
+    which an error or an interrupt removes. `progress` gets the name of a format and the completed fraction of it, 0 to
+    1, and `warn` each sentence on a file that is missing in the run folder (`RunContents.notes`).
 
-    Args:
-        progress: called with the name of a format and the completed fraction of it, 0 to 1.
-        warn: called with each sentence on a file that is missing in the run folder (`RunContents.notes`).
-
-    Raises:
-        TwinError: a format, an option or the run folder is not valid, the run lacks contents that a format needs, or a
-            subfolder is not empty or cannot be written; nothing was written. Or a package is missing, an image or the
-            true poses are damaged, or a file has the name of the hidden folder; earlier formats were written.
+    Raises TwinError if a format, an option or the run folder is not valid, the run lacks contents that a format needs,
+    or a subfolder is not empty or cannot be written; nothing was written. Or a package is missing, an image or the true
+    poses are damaged, or a file has the name of the hidden folder; earlier formats were written.
     """
     chosen = chosen_formats(names)
     contents = run_contents(folder, options)
@@ -146,7 +142,9 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
     rendered = scenario is not None and scenario.imaging.fidelity == "rendered"
     frames = recorded_frames(run)
     _check_poses(run, frames)
-    elevation = _elevation(run)
+    elevation, georeference, dem = _elevation(run), _given_georeference(options), folder / "dem.tif"
+    if georeference is None and dem.is_file():
+        georeference = geotiff.read_georeference(dem)
     return RunContents(
         folder=folder,
         name=str(run.scenario.get("name", folder.name)),
@@ -160,7 +158,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         error_m=_layer(run, "dem_error", elevation),
         true_map=folder / "dem_truth.tif" if "dem_truth" in run.rasters else None,
         orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
-        georeference=_georeference(folder, options),
+        georeference=georeference,
         jpeg_quality=options.jpeg_quality,
         notes=() if scenario is None else tuple(missing_files(run, scenario, frames)),
         renders_again=rendered and (folder / "frames" / "truth.npz").is_file(),
@@ -179,13 +177,6 @@ def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
             times_s = path.times_s
             if not (np.isfinite(times_s).all() and (np.diff(times_s) > 0).all() and (times_s >= 0).all()):
                 raise TwinError(file, "has times that do not increase", "an undamaged file, written by `twin run`")
-
-
-def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
-    if (given := _given_georeference(options)) is not None:
-        return given
-    file = folder / "dem.tif"
-    return geotiff.read_georeference(file) if file.is_file() else None
 
 
 def _given_georeference(options: ExportOptions) -> Georeference | None:

@@ -61,25 +61,15 @@ FORMATS = {name: ExportFormat(text, tuple(needs.split()), writer) for name, need
 
 #: What a format may need: whether a run has it, the problem of one that has not, and a run that has it.
 _NEEDS: dict[str, tuple[Callable[[RunContents], bool], str, str]] = {
-    "images": (
-        lambda run: bool(run.frames),
-        "has no images",
-        'a run of a scenario with record = "all" (every frame) or "keyframes"',
-    ),
-    "pairs": (
-        lambda run: bool(run.pairs), "has no stereo pairs", 'a run of a scenario with record = "all" or "keyframes"',
-    ),
-    "poses": (
-        lambda run: not run.trajectories.keys().isdisjoint(POSES),
-        "has neither a true nor a final trajectory",
-        "a run with trajectory_truth.tum or trajectory_final.tum",
-    ),
+    "images": (lambda run: bool(run.frames), "has no images",
+               'a run of a scenario with record = "all" (every frame) or "keyframes"'),
+    "pairs": (lambda run: bool(run.pairs), "has no stereo pairs",
+              'a run of a scenario with record = "all" or "keyframes"'),
+    "poses": (lambda run: not run.trajectories.keys().isdisjoint(POSES), "has neither a true nor a final trajectory",
+              "a run with trajectory_truth.tum or trajectory_final.tum"),
     "map": (lambda run: run.elevation is not None, "has no elevation map", "a run with dem.tif"),
-    "world": (
-        lambda run: run.renders_again,
-        "has no simulated world or no frames/truth.npz",
-        "a run of `twin run` with rendered images, whose record is not none",
-    ),
+    "world": (lambda run: run.renders_again, "has no simulated world or no frames/truth.npz",
+              "a run of `twin run` with rendered images, whose record is not none"),
 }  # fmt: skip
 
 

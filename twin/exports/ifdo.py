@@ -3,7 +3,6 @@
 import hashlib
 import json
 import uuid
-from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -11,35 +10,16 @@ from typing import Any
 import numpy as np
 
 from twin.core.records import Array
-from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
+from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes, read_json
 from twin.datasets.calibration import RecordedCamera
 from twin.datasets.image_copy import copy_all
 from twin.datasets.run_contents import RecordedFrame, RunContents
-from twin.exports.attitude import yaw_pitch_roll_deg
-from twin.exports.geographic_place import WGS84, Place, place_of, transformed
+from twin.exports.geographic_place import WGS84, Place, place_of, transformed, yaw_pitch_roll_deg
 
-VERSION = "v2.1.0"
 _START = datetime(1970, 1, 1, tzinfo=UTC)  # a run has no date
-_UNKNOWN = "unknown"
-#: Fields of the whole image set that state the origin of simulated images.
-_SIMULATED = {
-    "image-context": {"name": "simulated survey"},
-    "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
-    "image-license": {"name": "CC-BY-4.0", "uri": "https://creativecommons.org/licenses/by/4.0/"},
-    "image-copyright": "simulated images, no copyright holder",
-    "image-sensor": {"name": "stereo camera, simulated"},
-    "image-quality": "raw",
-}
-#: The same of the rectified images of a replay, of whose origin a run folder knows no more. Their light is left out.
-_RECORDED = {
-    "image-context": {"name": "replay of a recorded survey"},
-    "image-abstract": "Rectified images of a recorded stereo survey. Times count from 1970-01-01.",
-    "image-license": {"name": _UNKNOWN},
-    "image-copyright": _UNKNOWN,
-    "image-platform": {"name": _UNKNOWN},
-    "image-sensor": {"name": "stereo camera"},
-    "image-quality": "processed",
-}
+#: Fields of the whole image set: of all sets, of simulated images, and of the rectified images of a replay, of whose
+#: origin and light a run folder knows no more.
+_FIELDS = Path(__file__).with_name("ifdo_fields.json")
 _LOCAL = (
     " The file cannot state where on the Earth the images are: positions and orientations are local (metres, z up), in"
     " image-acquisition-settings, and yaw counts from the y axis."
@@ -67,37 +47,24 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 def _header(contents: RunContents, place: Place | None) -> dict[str, Any]:
     identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
-    header: dict[str, Any] = {
+    known, name = read_json(_FIELDS), {"name": contents.name}
+    fields = known["all"] | known["recorded" if "replay" in contents.scenario else "simulated"]
+    fields |= {
         "image-set-name": contents.name,
         "image-set-uuid": identifier,
         "image-set-handle": f"urn:uuid:{identifier}",
-        "image-set-ifdo-version": VERSION,
-        "image-creators": [{"name": "twin"}],
-        "image-pi": {"name": "twin"},
-        "image-acquisition": "photo",
-        "image-deployment": "survey",
-        "image-navigation": "reconstructed",
-        "image-pixel-magnitude": "mm",
-        "image-marine-zone": "seafloor",
-        "image-spectral-resolution": "rgb",
         "image-camera-calibration-model": _calibration(contents.believed.left),
-        "image-project": {"name": contents.name},
-        "image-event": {"name": contents.name},
+        "image-project": name,
+        "image-event": name,
     }
-    if "replay" in contents.scenario:
-        header |= _RECORDED
-    else:
+    if "replay" not in contents.scenario:
         vehicle = contents.scenario.get("vehicle", {}).get("title", "vehicle")
-        header |= _SIMULATED | {"image-illumination": _illumination(contents.scenario)}
-        header |= {"image-platform": {"name": f"{vehicle}, simulated"}}
+        fields["image-platform"] = {"name": f"{vehicle}, simulated"}
+        lamps, sun = contents.scenario.get("lamps"), contents.scenario.get("sun", {}).get("illuminance_lx", 0.0) > 0
+        fields["image-illumination"] = "sunlight" if not lamps else "mixed light" if sun else "artificial light"
     if place is None:
-        return header | {"image-abstract": header["image-abstract"] + _LOCAL}
-    return header | {"image-coordinate-reference-system": WGS84}
-
-
-def _illumination(scenario: Mapping[str, Any]) -> str:
-    lamps, sun = bool(scenario.get("lamps")), scenario.get("sun", {}).get("illuminance_lx", 0.0) > 0
-    return "mixed light" if lamps and sun else "artificial light" if lamps else "sunlight"
+        return fields | {"image-abstract": fields["image-abstract"] + _LOCAL}
+    return fields | {"image-coordinate-reference-system": WGS84}
 
 
 def _calibration(camera: RecordedCamera) -> dict[str, Any]:

@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from twin.core.georeference import Georeference
-from twin.core.records import Array
 from twin.datasets.image_copy import copy_all
 from twin.datasets.run_contents import RunContents
-from twin.exports.attitude import yaw_pitch_roll_deg
+from twin.exports.geographic_place import yaw_pitch_roll_deg
 
 _HEADER = "#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll"
 
@@ -24,15 +23,13 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         if name in contents.trajectories:
             file = folder / f"reference_{name}.csv"
             poses, rig = contents.trajectories[name].world_from_camera, contents.believed
-            found = ((image.file.name, poses[image.frame.index] @ rig.left_from(image.camera)) for image in images)
-            lines = [_line(label, pose, origin) for label, pose in found]
-            file.write_text("\n".join([_HEADER, *lines]) + "\n", encoding="utf-8")
+            lines = [_HEADER]
+            for image in images:
+                pose = poses[image.frame.index] @ rig.left_from(image.camera)
+                x, y, z = pose[:3, 3]
+                values = [*map(float, origin.from_scene(x, y)), z + origin.elevation_m]
+                angles = [f"{angle:.8f}" for angle in yaw_pitch_roll_deg(pose)]
+                lines.append(",".join([image.file.name, *(f"{value:.6f}" for value in values), *angles]))
+            file.write_text("\n".join(lines) + "\n", encoding="utf-8")
             written.append(file)
     return written
-
-
-def _line(label: str, pose: Array, origin: Georeference) -> str:
-    x, y, z = pose[:3, 3]
-    easting, northing = origin.from_scene(x, y)
-    angles = ",".join(f"{angle:.8f}" for angle in yaw_pitch_roll_deg(pose))
-    return f"{label},{float(easting):.6f},{float(northing):.6f},{z + origin.elevation_m:.6f},{angles}"

@@ -3,11 +3,11 @@
 import json
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 
 from twin.core.records import Array
+from twin.core.templates import filled
 from twin.errors import TwinError
 from twin.exports.planned_path import PlannedPath
 
@@ -15,7 +15,6 @@ from twin.exports.planned_path import PlannedPath
 _WAYPOINT, _CHANGE_SPEED = 16, 178
 _RELATIVE_ALTITUDE, _NO_POSITION = 3, 2
 _SUBMARINE, _ARDUPILOT = 12, 3
-_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
 
 
 def write_qgc(path: PlannedPath, file: Path) -> None:
@@ -51,24 +50,16 @@ def _simple_item(command: int, frame: int, params: list[Any]) -> dict[str, Any]:
 
 def write_kml(path: PlannedPath, file: Path) -> None:
     """Writes KML 2.2 with a line for each track, at elevations above sea level."""
-    places = []
-    for track in sorted(set(path.track.tolist())):
-        points = " ".join(f"{x:.9f},{y:.9f},{height:.3f}" for x, y, height in _geographic(path)[path.track == track])
-        places.append(
-            f"<Placemark><name>track {track}</name><LineString><altitudeMode>absolute</altitudeMode>"
-            f"<coordinates>{points}</coordinates></LineString></Placemark>\n"
-        )
-    head = f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>{escape(path.name)}</name>\n'
-    file.write_text(f"{head}{''.join(places)}</Document></kml>\n", encoding="utf-8")
+    points = _geographic(path)
+    tracks = {track: points[path.track == track] for track in np.unique(path.track).tolist()}
+    text = filled("twin.exports", "planned_path.kml.j2", {"name": path.name, "tracks": tracks})
+    file.write_text(text, encoding="utf-8")
 
 
 def write_gpx(path: PlannedPath, file: Path) -> None:
     """Writes GPX 1.1 with one route; `ele` is the elevation, negative below sea level."""
-    points = "".join(
-        f'<rtept lat="{y:.9f}" lon="{x:.9f}"><ele>{height:.3f}</ele></rtept>\n' for x, y, height in _geographic(path)
-    )
-    head = f'{_XML}<gpx version="1.1" creator="twin" xmlns="http://www.topografix.com/GPX/1/1">'
-    file.write_text(f"{head}<rte><name>{escape(path.name)}</name>\n{points}</rte></gpx>\n", encoding="utf-8")
+    text = filled("twin.exports", "planned_path.gpx.j2", {"name": path.name, "points": _geographic(path)})
+    file.write_text(text, encoding="utf-8")
 
 
 def write_csv(path: PlannedPath, file: Path) -> None:

@@ -64,9 +64,8 @@ def true_layers(
 ) -> tuple[list[str], Iterator[FrameTruth]]:
     """Returns the names of the objects, by label from 1, and the layers of the recorded frames, rendered when iterated.
 
-    Raises:
-        TwinError: frames/truth.npz, which has the true poses, is damaged, or the scenario can no longer be prepared;
-            while iterating: a recorded image cannot be read or has another size than those of the run.
+    Raises TwinError where frames/truth.npz, which has the true poses, is damaged, or the scenario can no longer be
+    prepared; while iterating, where a recorded image cannot be read or has another size than those of the run.
     """
     poses, twists = _true_motion(folder / "frames" / "truth.npz", max(frame.index for frame in frames))
     mission = prepare(scenario)
@@ -110,7 +109,8 @@ def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, t
                 identical = bool(np.array_equal(again, recorded))
             view = world.camera.decompose(pose, twist, frame.time_s)
             truth = _truth(mission, frame, view, pose, (recorded, identical))
-            truth = truth._replace(clean=_uint8(clear.decompose(pose, twist, frame.time_s).noise_free))
+            in_clear_water = np.nan_to_num(clear.decompose(pose, twist, frame.time_s).noise_free, nan=0.0)
+            truth = truth._replace(clean=np.clip(np.round(in_clear_water), 0, 255).astype(np.uint8))
             if earlier is not None:
                 before, pose_before = earlier
                 moved = geometry.inverse(pose) @ pose_before
@@ -227,10 +227,6 @@ def _points(depth_m: NDArray[np.floating], rig: StereoRig) -> Array:
     pixels = np.stack([cols, rows], -1).reshape(-1, 2).astype(np.float64)
     directions = np.column_stack([rig.normalised(pixels), np.ones(len(pixels))])
     return directions.reshape(*depth_m.shape, 3) * depth_m[..., None]
-
-
-def _uint8(image: Image) -> Image:
-    return np.clip(np.round(np.nan_to_num(image, nan=0.0)), 0, 255).astype(np.uint8)
 
 
 def _read(file: Path, rig: StereoRig) -> Image:

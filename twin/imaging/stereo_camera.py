@@ -1,7 +1,6 @@
 """Simulated stereo camera: renders the floor and computes light in the water, exposure and noise of each image."""
 
 import copy
-import functools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -88,7 +87,11 @@ class StereoCamera:
             metered = setting is not None
             if setting is None:  # metered on the first left image at rest
                 setting = self._meter(self._sensor, self._image_formation.radiance(views[0]), views[0].depth)
-            expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
+
+            def expose(view: RenderedView) -> tuple[Image, Radiance]:
+                light = self._at_raw_pixels(view, self._sensor, twist_body, setting)
+                return self._cameras.rectify(self._sensor.image(light, setting, self._rngs[view.camera])), light
+
             if stereo:
                 (left, light), (right, _) = in_pair(lambda: expose(views[0]), lambda: expose(views[1]))
             else:
@@ -144,10 +147,6 @@ class StereoCamera:
         world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
         with self._stopwatch("render"):
             return self._image_formation.view_of(self._renderer.render(world_from_camera), camera, pose)
-
-    def _expose(self, view: RenderedView, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
-        light = self._at_raw_pixels(view, self._sensor, twist_body, setting)
-        return self._cameras.rectify(self._sensor.image(light, setting, self._rngs[view.camera])), light
 
     def _meter(self, sensor: Sensor, light: Radiance, depth: Depth) -> ExposureSetting:
         return sensor.meter(self._cameras.sample(light, depth, 0))

@@ -94,17 +94,17 @@ def summarise(mission: Mission) -> PlanSummary:
     known = {f"{section}.{key}" for section, metrics in predicted.items() for key in metrics}
     require = judge_requirements({n: v for n, v in mission.scenario.require.items() if n in known}, predicted)
     holes = (note.removesuffix(".") for note in mission.hole_notes)
-    latency = _latency(mission)
+    scenario, latency = mission.scenario, None
+    if (
+        n_late := frames_of_latency(scenario)
+        if scenario.vehicle.dynamics == "rigid" and not scenario.control.plugin
+        else 0
+    ):
+        latency = Latency(n_late / mission.rig.frame_rate_hz, largest_latency_s(mission))
     late = [f"the latency is too long for a stable flight: {latency.text}"] if latency and latency.unstable else []
     warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error), *late)
     cost = computing_cost(mission, plane.n_keyframes)
     return PlanSummary(mission, plane, floor, error, cost, require, latency, warnings)
-
-
-def _latency(mission: Mission) -> Latency | None:
-    scenario = mission.scenario
-    n, own = frames_of_latency(scenario), scenario.vehicle.dynamics == "rigid" and scenario.control.plugin is None
-    return Latency(n / mission.rig.frame_rate_hz, largest_latency_s(mission)) if n and own else None
 
 
 def run_time_s(mission: Mission) -> float:
@@ -285,16 +285,11 @@ def floor_spreads(summary: PlanSummary) -> dict[str, Spread]:
     return {key: spread(values_of(summary)) for key, (_, _, values_of) in _PROPERTIES.items()}
 
 
-def _holes(mission: Mission) -> dict[str, float]:
-    """Returns the shares of floor and asked area without a height, and that of the nodes in small holes."""
-    t = mission.terrain
-    filled = t.n_filled / t.height_m.size - t.unknown_share
-    return {"floor": t.unknown_share, "asked_area": unknown_share(mission.plan, t), "filled": filled}
-
-
 def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
     """Returns the summary as a JSON object, with the path of the drawing of the plan."""
-    mission, plane = summary.mission, summary.plane._asdict()
+    mission, plane, t = summary.mission, summary.plane._asdict(), summary.mission.terrain
+    filled = t.n_filled / t.height_m.size - t.unknown_share  # share of the nodes in small holes
+    holes = {"floor": t.unknown_share, "asked_area": unknown_share(mission.plan, t), "filled": filled}
     return finite_tree(
         {
             "schema": "twin.plan/1",
@@ -305,7 +300,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
             "plan": plane | {"duration_s": plane["duration_s"] + summary.hold_s, "n_frames": mission.n_frames},
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},
             "coverage": summary.floor.coverage,
-            "holes": _holes(mission),
+            "holes": holes,
             "input": mission.stated_input,
             "expected": _predicted_metrics(summary.floor, summary.error),
             "require": summary.require,

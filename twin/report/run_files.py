@@ -18,7 +18,7 @@ _TRACK = {"track": 0} | dict.fromkeys(
     ("before_ga_rmse_m", "after_ga_rmse_m", "farthest_error_m", "ga_ms", "nodes", "edges")
 )
 _TASK = {"name": "", "track": 0} | dict.fromkeys((*MAP_KEYS, "area_map_le90_m", "error_before_m", "error_after_m"))
-#: Input statement of a floor that was read from files (`twin.terrains.input_statement`).
+#: Input statement of a floor that was read from files (`twin.terrains.terrain`).
 _INPUT = {
     **dict.fromkeys(("file", "crs", "spacing_evidence", "unit_evidence", "direction", "direction_evidence"), ""),
     **dict.fromkeys(("spacing_m", "metres_per_unit", "least", "greatest", "share_without_height"), 0.0),

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from twin.core.templates import filled
 from twin.core.user_files import read_text
 from twin.errors import TwinError
-from twin.reproduce.exhibit import Exhibit, Table
+from twin.reproduce.exhibit import Exhibit
 
 BEGIN = "<!-- begin: written by `twin reproduce chapter`, do not edit -->"
 END = "<!-- end: written by `twin reproduce chapter` -->"
@@ -18,28 +19,10 @@ SHOWN = (
 
 
 def chapter(exhibits: Sequence[Exhibit], quick: bool) -> str:
+    """Returns the chapter between its markers; a text stands above the first table of each experiment."""
     shown = [(e, t) for name, key in SHOWN for e in exhibits if e.name == name for t in e.tables if t.key == key]
-    plans = " (quick plans: `--quick`)" if quick else ""
-    lines = [
-        BEGIN, HEADING, "",
-        f"The experiments of Negahdaripour & Madjidi (2003), flown in the simulated world{plans}. `twin reproduce all` "
-        "writes these tables and all others, with the figures, to one page.",
-    ]  # fmt: skip
-    described = set[str]()
-    for exhibit, table in shown:
-        lines += [""] if exhibit.name in described else ["", f"**{exhibit.title}.** {exhibit.text}", ""]
-        described.add(exhibit.name)
-        lines += [f"*{table.title}*", "", *_markdown(table)]
-    return "\n".join([*lines, END])
-
-
-def _markdown(table: Table) -> list[str]:
-    header, *rows = [[cell.replace("|", "\\|") for cell in row] for row in table.rows]
-    return [_line(header), _line(["---"] * len(header)), *map(_line, rows)]
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |".replace("|  |", "| |")
+    context = {"shown": shown, "quick": quick, "begin": BEGIN, "end": END, "heading": HEADING}
+    return filled("twin.reproduce", "chapter.md.j2", context)
 
 
 def with_chapter(page: str, text: str, name: str = "page") -> str:

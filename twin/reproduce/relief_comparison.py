@@ -17,7 +17,6 @@ from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.lamp_halos import LampHalos
 from twin.imaging.light.optics import Optics, SceneView
 from twin.imaging.light.shadows import Shadows
-from twin.imaging.reference.pixel_light import PixelLight
 from twin.imaging.scene.facets import Facets
 from twin.reproduce.lamp_comparison import reference_light
 from twin.reproduce.light_cell import ALBEDO, GREEN, WALKS, Compared, LightCell, estimate, looking_down, text_of, within
@@ -89,7 +88,11 @@ def pixel_of(scenario: Scenario, name: str) -> tuple[int, int]:
 def _compared(scenario: Scenario, name: str, walks: int) -> dict[str, Compared]:
     """Returns the light of a pixel by the model and by the reference; the keys are those of `lamp_comparison`."""
     pixel, field = pixel_of(scenario, name), field_of(name)
-    truth = estimate(lambda one: reference_light(scenario, HEIGHT_M, pixel, one, field), _is_accurate, walks)
+    truth = estimate(
+        lambda one: reference_light(scenario, HEIGHT_M, pixel, one, field),
+        lambda light: within(LIGHT_ERROR, light.total) and light.sharp_share.standard_error <= SHARP_ERROR,
+        walks,
+    )
     model, unit = model_light(scenario, pixel, field), "_cd_m2"
     return {
         "total": Compared(model["total"], truth.total, unit),
@@ -97,10 +100,6 @@ def _compared(scenario: Scenario, name: str, walks: int) -> dict[str, Compared]:
         "sharp_share": Compared(model["direct"] / model["total"], truth.sharp_share),
         "veil": Compared(model["veil"], truth.veil, unit),
     }
-
-
-def _is_accurate(light: PixelLight) -> bool:
-    return within(LIGHT_ERROR, light.total) and light.sharp_share.standard_error <= SHARP_ERROR
 
 
 def model_light(scenario: Scenario, pixel: tuple[int, int], field: HeightField) -> dict[str, float]:

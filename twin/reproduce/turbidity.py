@@ -149,7 +149,11 @@ def draw(levels: Sequence[TurbidityLevel], file: Path) -> None:
     image_in = PANEL_IN * height / width
     with png_figure(file, PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6) as figure:
         grid = figure.add_gridspec(3, len(levels), height_ratios=[image_in, 1.6, 3.4])
-        figure.suptitle(_title(levels), fontsize=12)
+        title = (
+            f"One object at {len(levels)} turbidity levels: scattering of Jerlov type {JERLOV} multiplied by the "
+            f"turbidity, two lamps, equal mean exposure, {levels[0].quality['depth_median_m']:.2f} m below the camera"
+        )
+        figure.suptitle(title, fontsize=12)
         top = max(_histogram_of(level.image, band).max() for level in levels for band in range(3))
         for k, level in enumerate(levels):
             picture = figure.add_subplot(grid[0, k])
@@ -159,14 +163,6 @@ def draw(levels: Sequence[TurbidityLevel], file: Path) -> None:
             picture.set_title(f"turbidity {turbidity:g}   (green c = {c:.2f} /m)", loc="left")
             _histogram(figure.add_subplot(grid[1, k]), level, top, first=k == 0)
         _curves(figure.add_subplot(grid[2, :]), levels)
-
-
-def _title(levels: Sequence[TurbidityLevel]) -> str:
-    return (
-        f"One object at {len(levels)} turbidity levels: scattering of Jerlov type {levels[0].scenario.water.jerlov} "
-        f"multiplied by the turbidity, two lamps, equal mean exposure, "
-        f"{levels[0].quality['depth_median_m']:.2f} m below the camera"
-    )
 
 
 def _histogram_of(image: Any, band: int) -> Any:

@@ -385,19 +385,14 @@ def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
 _PREFIX = "Input should be "
 #: Allowed value for each type of pydantic error; for other types, pydantic's message is used.
 _ALLOWED = {
-    "model_type": "a section",
+    **dict.fromkeys(("model_type", "dict_type"), "a section"),
     "tuple_type": "a list",
-    "dict_type": "a section",
     "string_type": "a string",
     "string_too_short": "a non-empty string",
     "string_pattern_mismatch": "module:Class, or the name of an entry point",
-    "int_type": "an integer",
-    "int_parsing": "an integer",
-    "int_from_float": "an integer",
-    "float_type": "a number",
-    "float_parsing": "a number",
-    "bool_type": "true or false",
-    "bool_parsing": "true or false",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "an integer"),
+    **dict.fromkeys(("float_type", "float_parsing"), "a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
 }
 
 

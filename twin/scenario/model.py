@@ -1075,17 +1075,13 @@ class ControlConfig(Section):
     the shorter side of the footprint [m]"""
 
 
+SENSORS = ("pressure", "ahrs", "dvl", "usbl")  #: that can fail
 #: Parts that can fail, with the ways in which they can, in the words of PX4.
 FAULTS: dict[str, tuple[str, ...]] = {
     "thruster": ("off", "stuck", "wrong", "intermittent"),
-    "cameras": ("off", "stuck", "garbage", "intermittent"),
-    "left_camera": ("off", "stuck", "garbage", "intermittent"),
-    "right_camera": ("off", "stuck", "garbage", "intermittent"),
+    **dict.fromkeys(("cameras", "left_camera", "right_camera"), ("off", "stuck", "garbage", "intermittent")),
     "lamp": ("off", "intermittent"),
-    "pressure": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
-    "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
-    "dvl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
-    "usbl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    **dict.fromkeys(SENSORS, ("off", "stuck", "wrong", "garbage", "intermittent", "delayed")),
     "tether": ("stuck",),
     "water": ("silt", "gust"),
     "fish": ("school",),
@@ -1292,7 +1288,7 @@ class Scenario(Section):
         )  # fmt: skip
 
     def believed_noise(self) -> SensorNoise:
-        navigation = self.navigation
+        navigation, rate_hz = self.navigation, self.navigation.dvl_rate_hz
         return SensorNoise(
             navigation.pressure_sigma_m,
             float(np.deg2rad(navigation.attitude_sigma_deg)),
@@ -1304,12 +1300,8 @@ class Scenario(Section):
             tuple(beacon.position_m for beacon in self.beacons),
             imu=self._imu_noise() if "imu" in navigation.aiding else None,
             pressure_resolution_m=navigation.pressure_resolution_m,
-            dvl_interval_s=self._dvl_interval_s(),
+            dvl_interval_s=0.0 if rate_hz is None or rate_hz >= self.rig.frame_rate_hz else 1 / rate_hz,
         )
-
-    def _dvl_interval_s(self) -> float:
-        rate_hz = self.navigation.dvl_rate_hz
-        return 0.0 if rate_hz is None or rate_hz >= self.rig.frame_rate_hz else 1 / rate_hz
 
     def _imu_noise(self) -> ImuErrorModel | None:
         imu = self.imu

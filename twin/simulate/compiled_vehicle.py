@@ -52,11 +52,7 @@ class RigidBodyState(NamedTuple):
 class CompiledVehicle:
     """Vehicle under thrust, drag and current, integrated by compiled code.
 
-    Args:
-        sea: motion of the water.
-        world_from_body: (4, 4) initial pose.
-        floor: floor that the hull must not touch.
-        start_velocity_mps: (3,) initial velocity in the world.
+    It starts at a pose `world_from_body` (4, 4), with a velocity (3,) in the world; its hull must not touch `floor`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Beams that the floor reflects: the altimeter, and the bottom lock of the Doppler velocity log (DVL)."""
+"""Beams that the true floor, with its objects, reflects: altimeter, bottom lock of the Doppler velocity log (DVL)."""
 
 import numpy as np
 
@@ -11,11 +11,7 @@ _LEAST_BEAMS = 3  # of the DVL, which determine a velocity
 
 
 class Altimeter:
-    """Echo sounder at the left camera that looks along its optical axis; it returns the nearest echo within its beam.
-
-    Args:
-        floor: true floor, with its objects.
-    """
+    """Echo sounder at the left camera that looks along its optical axis: it returns the nearest echo in its beam."""
 
     def __init__(self, settings: NavigationConfig, floor: HeightField, rng: np.random.Generator):
         self._settings, self.floor, self._rng = settings, floor, rng
@@ -36,11 +32,7 @@ class Altimeter:
 
 
 class BottomLock:
-    """Bottom lock of a DVL at the origin of the body, with four beams around its downward axis (Janus configuration).
-
-    Args:
-        floor: true floor, with its objects.
-    """
+    """Bottom lock of a DVL at the origin of the body: four beams around its downward axis (Janus configuration)."""
 
     def __init__(self, range_m: tuple[float, float], beam_deg: float, floor: HeightField):
         self._range_m, self.floor = range_m, floor

@@ -34,11 +34,8 @@ class FaultEvent(NamedTuple):
 class Faults:
     """Faults of a survey; a fault of a rate per hour starts at random times, exponentially distributed.
 
-    Calls are in the order of time: first `at`, then the functions that change commands, images and readings.
-
-    Args:
-        duration_s: time up to which faults of a rate start.
-        rig, floor_m: calibration and distance to the floor [m], for what drifts in front of the cameras.
+    Calls are in the order of time: first `at`, then the functions that change commands, images and readings. Faults of
+    a rate start up to `duration_s`; what drifts before the cameras depends on rig and distance to the floor [m].
     """
 
     def __init__(

@@ -55,11 +55,8 @@ def _add_cross(out: Array, at: int, sign: float, a: Array, i: int, b: Array, j: 
 def acceleration(hull: Hull, world_from_body: Array, twist: Array, flow: Array, wrench: Array) -> Array:
     """Returns the acceleration nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2].
 
-    Args:
-        world_from_body: (3, 3) rotation.
-        twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
-        flow: (5, 3) motion of the water in the world, see `sea.flow_at`.
-        wrench: (6,) [moment, force] of the thrusters in body axes [N m, N].
+    At a rotation (3, 3) and a twist (6,) in body axes, in the flow (5, 3) of `sea.flow_at`, under the wrench (6,)
+    [moment, force] of the thrusters in body axes [N m, N].
     """
     current = np.zeros(6)  # R'v_c
     up = np.zeros(3)

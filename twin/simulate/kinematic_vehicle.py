@@ -14,11 +14,8 @@ class KinematicVehicle:
     """Vehicle that moves at the horizontal part of the commanded velocity, without rotation, thrust, drag or current.
 
     It is that of Negahdaripour & Madjidi (2003, section V-A), at first at rest and level at the pose `world_from_body`.
-
-    Attributes:
-        inertial: true [angular rate, specific force] (6,) in body axes [rad/s, m/s2]; the acceleration is the change of
-            velocity at the start of the last step, divided by the duration of the step.
-        after_timestep, touched: as in `MujocoVehicle`, with the steps of `step`.
+    `inertial`, `after_timestep` and `touched` are those of `MujocoVehicle`, with the steps of `step`: the acceleration
+    is the change of velocity at the start of the last step, divided by the duration of the step.
     """
 
     def __init__(self, world_from_body: Array):

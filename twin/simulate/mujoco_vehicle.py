@@ -28,19 +28,9 @@ class MujocoVehicle:
 
     MuJoCo's step (velocity first, then position with the new velocity) is interpreted as leapfrog integration: the
     velocity of the free joint refers to half a timestep before the pose. Without drag and thrust, energy is then
-    conserved to second order in the timestep.
-
-    Args:
-        model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
-        sea: motion of the water.
-        world_from_body: (4, 4) initial pose.
-        start_velocity_mps: (3,) initial velocity in the world.
-
-    Attributes:
-        tether: its tether; `snag` can be modified in place.
-        sea: motion of the water; `single_gusts` can be modified in place.
-        after_timestep: called with `inertial` after each timestep; None: nothing is called.
-        touched: returns which obstacle the hull touches at a pose world_from_body, "" for none.
+    conserved to second order in the timestep. The free body "vehicle" of the model has its origin at the centre of
+    gravity; it starts at a pose `world_from_body` (4, 4), with a velocity (3,) in the world. `tether.snag` and
+    `sea.single_gusts` can be modified in place.
     """
 
     def __init__(
@@ -64,8 +54,8 @@ class MujocoVehicle:
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
         self._velocity[:3] = start_velocity_mps
         mujoco.mj_step1(model, self._data)
-        self.after_timestep: Callable[[Array], None] | None = None
-        self.touched: Callable[[Array], str] = nothing
+        self.after_timestep: Callable[[Array], None] | None = None  #: called with `inertial` after each timestep
+        self.touched: Callable[[Array], str] = nothing  #: the obstacle that the hull touches at a pose, "" for none
 
     def __getstate__(self) -> dict[str, Any]:
         whole = mujoco.mjtState.mjSTATE_INTEGRATION

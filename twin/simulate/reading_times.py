@@ -22,11 +22,7 @@ def is_due(rate_hz: float | None, frames: NDArray[np.int64], frame_rate_hz: floa
 
 
 class Delays:
-    """Readings on their way from the sensors to the estimators.
-
-    Args:
-        delays_s: delay of each sensor that has one [s].
-    """
+    """Readings on their way from the sensors to the estimators; `delays_s` has the sensors with a delay."""
 
     def __init__(self, delays_s: Mapping[str, float]):
         self._delays = [(_FIELDS[name], delay_s) for name, delay_s in delays_s.items()]

@@ -38,15 +38,9 @@ class PerFrameSensors(NamedTuple):
 class NavigationSensors:
     """Navigation sensors of a vehicle; the sensors in `navigation.aiding` and the IMU return readings.
 
-    Noise is sampled for every sensor and every beacon, used or not, so that random numbers do not depend on these.
-
-    Args:
-        rig: believed calibration of the stereo rig.
-        rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
-        project: projects points (n, 3) in left camera axes to pixels (n, 2) as truly calibrated; None: as `rig`.
-
-    Attributes:
-        per_frame: parameters of the sensors that are read at every frame, also for compiled code.
+    Noise is sampled for every sensor and every beacon, used or not, so that random numbers do not depend on these;
+    `rng` has a generator for "navigation" (pressure and attitude), "dvl", "usbl" and "beacons". `project` projects
+    points (n, 3) in left camera axes to pixels (n, 2) as truly calibrated; None: as `rig`, the believed calibration.
     """
 
     def __init__(
@@ -125,11 +119,8 @@ def read_per_frame_sensors(sensors, world_from_body, twist_body, numbers, dvl_nu
 
     These are height of the left camera [m], roll, pitch and yaw of the body (3,) [rad], and velocity (3,) of the body's
     origin over ground in body axes [m/s]. The pressure sensor is in the housing of the left camera: its reading needs
-    no lever-arm correction, which attitude errors would affect.
-
-    Args:
-        world_from_body, twist_body: true, as in `NavigationSensors.read`.
-        numbers, dvl_numbers: (4,) and (3,) standard normal numbers, see `NavigationSensors.draw_noise`.
+    no lever-arm correction, which attitude errors would affect. Pose and twist are those of `NavigationSensors.read`,
+    the standard normal numbers (4,) and (3,) those of `NavigationSensors.draw_noise`.
     """
     up, arm = world_from_body[2], sensors.body_from_camera[:3, 3]
     height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
@@ -178,12 +169,8 @@ class InertialSensor:
 
     The true motion is interpolated linearly at the times of the readings, k / rate. Noise model of Kalibr: at a rate f,
     white noise of density s has the standard deviation s sqrt(f), and the bias changes from reading to reading by steps
-    of w / sqrt(f), with w the density of its random walk.
-
-    Args:
-        motion_rate_hz: rate of the values given to `add`.
-        start: (6,) true [angular rate, specific force] at 0 s, in body axes [rad/s, m/s2].
-        rng: random generator of this sensor only.
+    of w / sqrt(f), with w the density of its random walk. `start` (6,) is the first of the values that `add` gets at
+    `motion_rate_hz`; `rng` is of this sensor only.
     """
 
     def __init__(self, settings: ImuConfig, motion_rate_hz: float, start: Array, rng: np.random.Generator):
@@ -198,7 +185,7 @@ class InertialSensor:
         self._n_read = 0
 
     def add(self, true: Array) -> None:
-        """Adds the true [angular rate, specific force] (6,) of the next step of the motion."""
+        """Adds the true [angular rate, specific force] (6,) of the next step, in body axes [rad/s, m/s2]."""
         self._true.append(true)
 
     def read(self) -> ImuReadings:

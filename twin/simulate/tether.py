@@ -56,9 +56,8 @@ def steady_pulls(tether: Tether, current_mps: Array, position_m: Array, yaw: Arr
 def add_tether(wrench, tether, sea, time_s, world_from_body, position, velocity):
     """Adds the pull of the tether to a wrench (6,) [moment, force] in body axes [N m, N].
 
-    Args:
-        world_from_body, position: (3, 3) rotation and (3,) position of the centre of gravity.
-        velocity: (6,) velocity in the coordinates of a free joint: [linear in the world, angular in the body].
+    At a rotation (3, 3) and a position (3,) of the centre of gravity, with a velocity (6,) in the coordinates of a free
+    joint: [linear in the world, angular in the body].
     """
     if tether.length_m == 0.0 and tether.snag[0] == 0.0:
         return

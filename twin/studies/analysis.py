@@ -96,7 +96,9 @@ class StudyAnalysis:
         self.counted = self.evaluated | self.unknown  # in pass probabilities
         self.complete = self.evaluated & (self.status == "complete")
         self.keys = [key for key in study.varied_keys if f"vary.{key}" in rows.column_names]
-        self.limits = self._limits()
+        columns = [re.fullmatch(r"require\.(.+)\.limit", column) for column in rows.column_names]
+        limits = {match[1]: self.numbers(match[0]) for match in columns if match}
+        self.limits = {name: float(np.nanmax(v)) if np.isfinite(v).any() else np.nan for name, v in limits.items()}
         names = [n for n in with_completeness([*self.limits, *study.show]) if n in rows.column_names]
         self.metrics = [n for n in names if n in self.limits or np.isfinite(self.numbers(n)).any()]
         met = [self.numbers(f"require.{name}.passed") == 1 for name in self.limits]
@@ -124,11 +126,6 @@ class StudyAnalysis:
             seen.add(identity)
         return duplicate
 
-    def _limits(self) -> dict[str, float]:
-        columns = [re.fullmatch(r"require\.(.+)\.limit", column) for column in self.rows.column_names]
-        limits = {match[1]: self.numbers(match[0]) for match in columns if match}
-        return {name: float(np.nanmax(v)) if np.isfinite(v).any() else np.nan for name, v in limits.items()}
-
     def included(self, metric: str) -> Mask:
         """Returns the complete surveys (n,) with a finite metric; "vision." also counts degraded and aborted ones."""
         flown = self.evaluated if metric.startswith("vision.") else self.complete
@@ -143,6 +140,10 @@ class StudyAnalysis:
     @cached_property
     def clusters(self) -> Array:
         return self.numbers(self.cluster_name)
+
+    @property
+    def n_clusters(self) -> int:
+        return len(np.unique(self.clusters))
 
     @property
     def n_rendered(self) -> int:
@@ -183,17 +184,16 @@ class StudyAnalysis:
 
     @cached_property
     def metric_summaries(self) -> list[MetricSummary]:
-        return [self._metric_summary(name) for name in self.metrics]
-
-    def _metric_summary(self, name: str) -> MetricSummary:
-        included = self.included(name)
-        data, clusters = self.numbers(name)[included], self.clusters[included]
-        further = self.clusters[self.unknown]
-        median, bound = (
-            statistics.bootstrap_with_unknown(data, lambda v, q=q: statistics.percentile(v, q), clusters, further)
-            for q in (50.0, 5.0 if more_is_better(name) else 95.0)
-        )
-        return MetricSummary(name, len(data), median, bound, self.limits.get(name))
+        found, further = [], self.clusters[self.unknown]
+        for name in self.metrics:
+            included = self.included(name)
+            data, clusters = self.numbers(name)[included], self.clusters[included]
+            median, bound = (
+                statistics.bootstrap_with_unknown(data, lambda v, q=q: statistics.percentile(v, q), clusters, further)
+                for q in (50.0, 5.0 if more_is_better(name) else 95.0)
+            )
+            found.append(MetricSummary(name, len(data), median, bound, self.limits.get(name)))
+        return found
 
     @cached_property
     def sensitivities(self) -> list[Sensitivity]:

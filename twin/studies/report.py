@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from twin.core.templates import filled
 from twin.core.user_files import read_text
 from twin.report.html import render_page
 from twin.report.style import FIGURE_STYLE
@@ -48,20 +49,8 @@ def write_agreement(analysis: StudyAnalysis, folder: Path) -> None:
         return
     with matplotlib.rc_context(FIGURE_STYLE):
         study_figures.agreement_of_pairs(analysis).savefig(folder / "agreement.png", bbox_inches="tight")
-    limits = ", ".join(
-        f"{sentences.metric_name(name)} {sentences.metric_value(name, v)}" for name, v in study.limits.items()
-    )
-    table = [agreement.HEADER, ("---",) * len(agreement.HEADER), *agreement.table(result)]
-    lines = [
-        "# Agreement of surrogate with rendered surveys", "",
-        f"`twin study {study.name}` flies {study.n_surveys // 2} pairs of surveys, each rendered and with the "
-        "surrogate, and writes this page and its figure to the results folder; `make agreement` copies them here. "
-        f"Requirements of a survey: {limits}.", "",
-        agreement.verdict_line(result), "", *(f"| {' | '.join(row)} |" for row in table), "", agreement.LIMITS, "",
-        "![Surrogate against rendered values](agreement.png)", "",
-        "Each dot is a pair with the same scenario and seed. Values at the upper or right edge are infinite.", "",
-    ]  # fmt: skip
-    (folder / "agreement.md").write_text("\n".join(lines), encoding="utf-8")
+    context = {"study": study, "agreement": agreement, "result": result, "sentences": sentences}
+    (folder / "agreement.md").write_text(filled("twin.studies", "agreement.md.j2", context), encoding="utf-8")
 
 
 def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, Any]:

@@ -102,12 +102,17 @@ def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet, render_ref
             interrupted = not _render_refused(study, folder, log, fleet, add_row)
         throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
         analysis, page = StudyAnalysis(log.table(planned), study, len(planned)), folder / "study.html"
-        write_errors = _write_errors(
+        write_errors = list[str]()
+        for write in (
             log.flush,
             lambda: write_parquet(analysis.rows, folder / "results.parquet"),
             lambda: write_report(analysis, page),
             lambda: write_agreement(analysis, folder),
-        )
+        ):
+            try:
+                write()
+            except OSError as error:
+                write_errors.append(str(error))
         return StudyResult(analysis, page, write_errors, interrupted, throughput)
 
 
@@ -202,14 +207,3 @@ def _another_study(log: ResultsLog) -> TwinError:
 def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:
     row = outcome.result or row_of(outcome.task, "failed", outcome.failure)
     return row | {"timing.attempts": outcome.attempts}
-
-
-def _write_errors(*writes: Callable[[], object]) -> list[str]:
-    """Calls every function and returns the messages of the OSErrors."""
-    errors = []
-    for write in writes:
-        try:
-            write()
-        except OSError as error:
-            errors.append(str(error))
-    return errors

@@ -83,7 +83,9 @@ def counted(n: int, noun: str) -> str:
 def headline(analysis: StudyAnalysis) -> str:
     """Returns the main results of a study as text; without an evaluated survey, only which surveys are not counted."""
     n, study = int(analysis.evaluated.sum()), analysis.study
-    left_out = [*_refused(analysis), *_duplicates(analysis), *_failed(analysis), *_not_flown(analysis)]
+    left_out = [*_refused(analysis), *_duplicates(analysis), *_failed(analysis)]
+    if n_left := analysis.not_flown:
+        left_out.append(f"The study is not finished: {counted(n_left, 'survey')} not flown yet; --resume continues it.")
     if n == 0:
         return " ".join(["No survey could be evaluated.", *left_out])
     limits = [
@@ -96,8 +98,12 @@ def headline(analysis: StudyAnalysis) -> str:
         f"{int(analysis.passed.sum())} of {n} surveys {completed}."
     )
     answers = answer_lines(analysis, [study.seek] if study.seek else [])
-    conclusions = [*_requirement(analysis), *_main_reason(analysis)]
-    return " ".join([*answers, result, *conclusions, *left_out, *_warnings(analysis)])
+    reasons = [] if analysis.passed.any() else analysis.failure_reasons[:1]
+    conclusions = [*_requirement(analysis), *(f"The most frequent reason: {one.reason}." for one in reasons)]
+    different, warnings = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)[:1]
+    n_warned = int((different != "").sum())
+    warned = [f"Warning in {n_warned} of {len(different)} surveys: {text.rstrip('.')}." for text in warnings]
+    return " ".join([*answers, result, *conclusions, *left_out, *warned])
 
 
 def answer_lines(analysis: StudyAnalysis, keys: Sequence[str] | None = None) -> list[str]:
@@ -201,11 +207,6 @@ def _requirement(analysis: StudyAnalysis) -> list[str]:
     return [f"The required {percent(required)} is {verdict}{where}{doubt}."]
 
 
-def _main_reason(analysis: StudyAnalysis) -> list[str]:
-    reasons = [] if analysis.passed.any() else analysis.failure_reasons[:1]
-    return [f"The most frequent reason: {reason.reason}." for reason in reasons]
-
-
 def _refused(analysis: StudyAnalysis) -> list[str]:
     sentences = []
     if (refused := analysis.refused & ~analysis.unmodelled).any():
@@ -246,27 +247,6 @@ def _failed(analysis: StudyAnalysis) -> list[str]:
     return [
         f"{subject} failed because of the computer or the program, so {result} unknown; --resume flies {again} again."
     ]
-
-
-def _not_flown(analysis: StudyAnalysis) -> list[str]:
-    n = analysis.not_flown
-    return [f"The study is not finished: {counted(n, 'survey')} not flown yet; --resume continues it."] if n else []
-
-
-def _warnings(analysis: StudyAnalysis) -> list[str]:
-    different, texts = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)[:1]
-    n = int((different != "").sum())
-    return [f"Warning in {n} of {len(different)} surveys: {text.rstrip('.')}." for text in texts]
-
-
-def independence_note(analysis: StudyAnalysis) -> str:
-    n, name = len(np.unique(analysis.clusters)), analysis.cluster_name
-    if n == analysis.rows.num_rows:
-        return "The confidence intervals assume that the surveys are independent."
-    return (
-        f"The confidence intervals assume that the {n} {name}s are independent; surveys of the same {name} may be "
-        "correlated."
-    )
 
 
 def seeds_note(study: Study) -> str:

@@ -161,9 +161,8 @@ class Study(Section):
 def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
     """Reads and validates a study file and the scenario file that it names.
 
-    Raises:
-        ScenarioError: a file does not exist or is not valid; lists the errors of the study file or, if it has none,
-            those of the scenario file, each as `FILE:LINE: key: problem (allowed: ...)`.
+    Raises ScenarioError if a file does not exist or is not valid; it lists the errors of the study file or, if it has
+    none, those of the scenario file, each as `FILE:LINE: key: problem (allowed: ...)`.
     """
     file = _find_study(path)
     tree, lines = read_toml(file)

@@ -40,18 +40,14 @@ RELIEF_GAIN, BIAS_FRACTION = 10.0, 0.8
 
 
 class ComparisonVision:
-    """Implementation of `Vision` that measures in images and collects statistics of a comparison with the surrogate.
-
-    Attributes:
-        statistics: samples by name; see `fit`.
-        classes: measured values and medians of the conditions of each class of map cells, by kind of value.
-    """
+    """Implementation of `Vision` that measures in images and collects statistics of a comparison with the surrogate."""
 
     def __init__(self, images: StereoVision, surrogate: SurrogateVision, true_pose: Callable[[], Array]):
         self.images, self.surrogate, self._true_pose = images, surrogate, true_pose
         self.stereo_observations = images.stereo_observations
         self.runs_in_background = images.runs_in_background
-        self.statistics: dict[str, list[float]] = defaultdict(list)
+        self.statistics: dict[str, list[float]] = defaultdict(list)  #: samples by name; see `fit`
+        #: measured values and medians of the conditions of each class of map cells, by kind of value
         self.classes: dict[str, list[list[float]]] = defaultdict(list)
         self.statistics["lamp_share"] = [surrogate.matchability.lamp_share]
         self._poses: dict[int, Array] = {}

@@ -37,6 +37,7 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
     shown = [candidate for candidate in result.candidates if candidate.has_metrics]
     front = pareto_front(result.candidates, tuning_config(result.study))
     groups, figures, compared = _groups(shown, front, result), {}, compared_plans(result)
+    known = {n for c in compared for n, (_, flown) in c.verification.medians.items() if flown is not None}
     with matplotlib.rc_context(FIGURE_STYLE):
         trade_off = _trade_off_figure(groups, result)
         if shown:
@@ -54,7 +55,7 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
         "warnings": warnings(result),
         "figures": figures,
         "compared": compared,
-        "metrics": [n for n in (compared[0].verification.medians if compared else ()) if _is_known(n, compared)],
+        "metrics": [name for name in (compared[0].verification.medians if compared else ()) if name in known],
         "required": required_probability(result.study),
         "plan": plan_toml(result),
         "plan_file": plan_file(result),
@@ -73,7 +74,7 @@ def headline(result: TuningResult) -> str:
     count = f"{len(result.candidates)} plans were evaluated"
     if n_rendered := len(result.verifications):
         count += f", {n_rendered} of them also in rendered surveys"
-    chosen = result.recommended
+    chosen, failed = result.recommended, result.failed_cheaper
     if (verification := result.verification(chosen)) is None or chosen is None:
         return f"No plan is recommended: {_missing_plan(result, count)}"
     medians = ", ".join(
@@ -81,25 +82,18 @@ def headline(result: TuningResult) -> str:
         for name, (surrogate, rendered) in verification.medians.items()
         if rendered is not None
     )
-    return " ".join(
-        [
-            f"{result.instructions}: {verification.counts()}; {verification.state()}. Medians rendered (surrogate): "
-            f"{medians}; by the surrogate, pass probability with new seeds "
-            f"{sentences.confidence(chosen.pass_probability)}. {count}. In the scenario, {_values(chosen)}.",
-            *_cheaper(result),
-            *(["The budget was used up before cheaper plans were tried."] if result.out_of_time else []),
-        ]
+    text = (
+        f"{result.instructions}: {verification.counts()}; {verification.state()}. Medians rendered (surrogate): "
+        f"{medians}; by the surrogate, pass probability with new seeds "
+        f"{sentences.confidence(chosen.pass_probability)}. {count}. In the scenario, {_values(chosen)}."
     )
+    if failed:
+        text += f" The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}."
+    return text + (" The budget was used up before cheaper plans were tried." if result.out_of_time else "")
 
 
 def _values(plan: Candidate) -> str:
     return ", ".join(f"{key} = {plain(value)}" for key, value in plan.values.items())
-
-
-def _cheaper(result: TuningResult) -> list[str]:
-    """Returns a sentence on the next cheaper plan that was flown rendered and not shown, if there is one."""
-    found = result.failed_cheaper
-    return [f"The next cheaper plan, {_values(found.surrogate)}, is not shown: {found.why_not()}."] if found else []
 
 
 def _missing_plan(result: TuningResult, count: str) -> str:
@@ -135,10 +129,6 @@ class ComparedPlan(NamedTuple):
     name: str
     verification: Verification
     note: str  #: what the rendered surveys show, or why the plan is not recommended
-
-
-def _is_known(metric: str, rows: list[ComparedPlan]) -> bool:
-    return any(row.verification.medians[metric][1] is not None for row in rows)
 
 
 def compared_plans(result: TuningResult) -> list[ComparedPlan]:

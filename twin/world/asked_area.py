@@ -1,10 +1,11 @@
-"""Placement of the survey area in the scene: centre, heading, and polygon from a list or a file."""
+"""Survey area in the scene: centre, heading, and polygon from a list, KML, a plan of QGroundControl, or GeoJSON."""
 
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
+from xml.etree import ElementTree
 
 import numpy as np
 import shapely
@@ -12,17 +13,62 @@ import shapely
 from twin.controllers.survey_area import Corner, SurveyArea, polygons_area
 from twin.core.georeference import Georeference
 from twin.core.records import Array
-from twin.core.user_files import read_json
+from twin.core.user_files import read_bytes, read_json, reading
 from twin.errors import TwinError
 from twin.scenario.model import PlanConfig
 from twin.terrains import Terrain
-from twin.world.area_files import KEY, MOST_BYTES, kml_polygons, qgc_polygons
 
+KEY = "plan.polygon"
+MOST_BYTES = 10_000_000  #: of a file of an area
+_KML = "KML with one Polygon or more"
+_QGC = "a .plan of QGroundControl with one survey or more"
 _POLYGONS = "GeoJSON with one Polygon or more"
 _MOST_NODES = 1_000_000  #: of the floor, from which its mean slope is computed
 _LEAST_SLOPE = 1e-3  #: below it, a floor counts as level
 #: CRS of a GeoJSON file without a member "crs", if its coordinates are longitude and latitude (RFC 7946).
 _LONGITUDE_LATITUDE = "OGC:CRS84"
+
+
+def kml_polygons(file: Path) -> list[shapely.Polygon]:
+    """Returns the polygons of a KML file in longitude and latitude; points and lines are left out.
+
+    Raises TwinError if it is not valid, has a document type (which may name other files) or no polygon.
+    """
+    data = read_bytes(file, KEY, _KML, MOST_BYTES)
+    with reading(file, KEY, _KML):
+        if b"<!" in data.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or b"\0" in data:
+            raise ValueError("a document type or an encoding other than UTF-8")
+        polygons = [_kml_polygon(found) for found in ElementTree.fromstring(data).iterfind(".//{*}Polygon")]
+        if not polygons:
+            raise ValueError("no polygon")
+        return polygons
+
+
+def _kml_polygon(element: ElementTree.Element) -> shapely.Polygon:
+    outer, inner = (
+        [_kml_ring(text) for text in element.findall(f"{{*}}{side}/{{*}}LinearRing/{{*}}coordinates")]
+        for side in ("outerBoundaryIs", "innerBoundaryIs")
+    )
+    (outline,) = outer
+    return shapely.Polygon(outline, inner)
+
+
+def _kml_ring(coordinates: ElementTree.Element) -> list[tuple[float, float]]:
+    triples = [triple.split(",") for triple in (coordinates.text or "").split()]
+    return [(float(longitude), float(latitude)) for longitude, latitude, *_ in triples]
+
+
+def qgc_polygons(file: Path) -> list[shapely.Polygon]:
+    """Returns the areas of the surveys in a plan of QGroundControl, in longitude and latitude.
+
+    Raises TwinError if it is not valid or has no survey; its geofence, a limit of the vehicle, is left out.
+    """
+    tree = read_json(file, KEY, _QGC, MOST_BYTES)
+    with reading(file, KEY, _QGC):
+        surveys = [item for item in tree["mission"]["items"] if item.get("complexItemType") == "survey"]
+        if not surveys:
+            raise ValueError("no survey")
+        return [shapely.Polygon([corner[::-1] for corner in item["polygon"]]) for item in surveys]
 
 
 def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
@@ -123,8 +169,9 @@ def read_area(file: Path, terrain: Terrain) -> list[list[Array]]:
     if not np.isfinite(corners).all():
         raise TwinError(KEY, f"{file.name!r} has a coordinate that is not finite", "finite numbers")
     origin = _georeference(KEY, terrain)
-    if crs is None and _is_longitude_latitude(corners, terrain, origin):
-        crs = _LONGITUDE_LATITUDE
+    if crs is None and origin.crs_wkt is not None and (np.abs(corners) <= [180.0, 90.0]).all():
+        is_off_the_dem = np.isnan(terrain.height_at(*origin.to_scene(*corners.T))).all()
+        crs = _LONGITUDE_LATITUDE if is_off_the_dem else None
     if crs is not None:
         corners = _projected(corners, crs, origin)
     lengths = [len(ring.coords) for polygon in rings for ring in polygon]
@@ -149,12 +196,6 @@ def _named_crs(tree: Any) -> str | None:
         return str(tree["crs"]["properties"]["name"])
     except (KeyError, TypeError):
         return None
-
-
-def _is_longitude_latitude(corners: Array, terrain: Terrain, origin: Georeference) -> bool:
-    within = (np.abs(corners) <= [180.0, 90.0]).all()
-    x, y = origin.to_scene(*corners.T)
-    return bool(within and origin.crs_wkt is not None and np.isnan(terrain.height_at(x, y)).all())
 
 
 def _projected(corners: Array, crs: str, origin: Georeference) -> Array:

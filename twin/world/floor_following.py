@@ -25,11 +25,8 @@ class FloorFollower:
     """Measures the floor during the flight, and makes the surface that the camera follows above it.
 
     Heights are averages over cells, from readings of the altimeter or from the stereo points of keyframes, at the
-    online poses; they are relative to the floor as known before the survey.
-
-    Attributes:
-        rise_m: height of the surface above the asked one; it stays clear of obstacles.
-        beside_m: horizontal distance from the planned path up to which it is clear of obstacles.
+    online poses; they are relative to the floor as known before the survey. The surface is `rise_m` above the asked
+    one, and clear of obstacles, also `beside_m` beside the planned path.
     """
 
     def __init__(self, mission: Mission):

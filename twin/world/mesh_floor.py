@@ -22,11 +22,10 @@ from twin.imaging.scene.object_shadows import FROM_ABOVE
 from twin.imaging.scene.object_view import Objects, draw_objects
 from twin.scenario.model import Scenario, TerrainConfig
 from twin.terrains.holes import known_nodes
-from twin.terrains.input_statement import InputStatement
 from twin.terrains.objects.coloured_mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
 from twin.terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
-from twin.terrains.terrain import texture_shape
+from twin.terrains.terrain import InputStatement, texture_shape
 from twin.terrains.vertical_axis import ASSUMED
 from twin.world.top_surface import FROM_BELOW, OVERHANG_M, Layer, TopSurface, row_blocks, true_heights, view_from_above
 
@@ -60,7 +59,8 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     whole, top = raised(whole, -lowest_m), top - lowest_m
     upward = upward_part(whole.mesh)
     tiles = tiles_of(whole)
-    drawn, nearest = Objects((), floor=tiles), _nearest(covered)
+    rows, cols = distance_transform_edt(~covered, return_distances=False, return_indices=True)  # pyright: ignore
+    drawn, nearest = Objects((), floor=tiles), (rows, cols)
     top_m = top[nearest]
     colours = _colours(drawn, grid, grid.cell_m)[0][nearest]
     low = _lowest(upward, grid)
@@ -133,11 +133,6 @@ def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
     cells = np.clip(row, 0, grid.rows - 1).astype(np.int64), np.clip(col, 0, grid.cols - 1).astype(np.int64)
     np.minimum.at(low, cells, z)
     return low
-
-
-def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    rows, cols = distance_transform_edt(~covered, return_distances=False, return_indices=True)  # pyright: ignore
-    return rows, cols
 
 
 def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArray[np.bool_]]:

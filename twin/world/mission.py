@@ -32,9 +32,8 @@ from twin.simulate.sea import make_sea, mean_current_mps
 from twin.simulate.sensors import imu_rate_hz
 from twin.simulate.tether import tether_of
 from twin.terrains.objects.placed_object import PlacedObject
-from twin.world.chart import chart_of
 from twin.world.computer import check_computer
-from twin.world.height_floor import load_terrain
+from twin.world.height_floor import chart_of, load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
 from twin.world.pace import SAME_TIME_S, Pace
@@ -255,16 +254,10 @@ def prepare(scenario: Scenario) -> Mission:
         grid = errors.attempt(
             _grid, scenario.map.cell_m, plan, {id(floor): floor for floor in (chart, terrain)}.values()
         )
-    if (
-        errors.lines
-        or terrain is None
-        or chart is None
-        or plan is None
-        or grid is None
-        or true_cameras is None
-        or illumination is None
-    ):
+    if errors.lines:
         raise ScenarioError(errors.lines)
+    assert terrain is not None and chart is not None and plan is not None and grid is not None
+    assert true_cameras is not None and illumination is not None
     return Mission(
         scenario, terrain, chart, plan, scenario.believed_rig(), grid, true_cameras, illumination, objects, mesh_floor
     )
@@ -284,13 +277,10 @@ def _check_equipment(scenario: Scenario, errors: _Errors) -> tuple[TrueCameras |
     if scenario.imu is not None:
         errors.attempt(imu_rate_hz, scenario.imu, motion_rate_hz(scenario))
     errors.attempt(check_require, scenario.require)
-    return errors.attempt(make_true_cameras, scenario), errors.attempt(_illumination, scenario)
-
-
-def _illumination(scenario: Scenario) -> Illumination:
-    illumination = illumination_of(scenario)
-    light_sources_in_camera(scenario.believed_rig(), scenario.lamps, illumination.daylight, 0)
-    return illumination
+    cameras = errors.attempt(make_true_cameras, scenario)
+    if (light := errors.attempt(illumination_of, scenario)) is not None:
+        errors.attempt(light_sources_in_camera, scenario.believed_rig(), scenario.lamps, light.daylight, 0)
+    return cameras, light
 
 
 def motion_rate_hz(scenario: Scenario) -> float:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,30 +14,45 @@ from twin.core.records import Frame
 from twin.core.settings import BRAKING_S
 from twin.world.mission import FrameSequence, Mission
 from twin.world.pace import FULL, Pace
-from twin.world.path_change import PathChange
 from twin.world.world import FastForward, World
 
+_RATE_RADPS = 1.5  #: rate at which the difference of the paths decays, about the bandwidth of the controller
+
+
+class PathChange(NamedTuple):
+    """Transition from the last path to a new one, without a step of position or velocity; arrays are (3,)."""
+
+    left_m: Array  #: last minus new position at its start
+    rate_mps: Array  #: last minus new velocity there
+    start: int  #: frame at which it starts
+    offset_m: Array = np.zeros(3)  #: offset of the new path from the planned one
+
+    def at(self, first: int, n: int, rate_hz: float) -> tuple[Array, Array, Array]:
+        """Returns what is left (n, 3) of the difference and its two derivatives at n frames from number `first` on."""
+        w, t = _RATE_RADPS, ((first - self.start + np.arange(n)) / rate_hz)[:, None]
+        slope, decay = self.rate_mps + w * self.left_m, np.exp(-w * t)
+        left = (self.left_m + slope * t) * decay
+        rate = slope * decay - w * left
+        return left, rate, -w * (slope * decay + rate)
+
+    def added_to(self, reference: Reference, first: int, rate_hz: float) -> Reference:
+        """Returns the references of consecutive frames, of which the first has the number `first`."""
+        left, rate, acceleration = self.at(first, len(reference.position), rate_hz)
+        return reference._replace(
+            position=reference.position + left + self.offset_m,
+            velocity=reference.velocity + rate,
+            acceleration=reference.acceleration + acceleration,
+        )
+
+
 _SAME_FACTOR = 0.01  # a factor of the pace that differs by less is set to the one that it approaches
-
-
-def _no_further_path(last: Reference, end: Point) -> tuple[Segment, ...]:
-    return ()
 
 
 class Flight:
     """Flight of a mission through its world: all tracks, with station keeping after each of them.
 
-    Args:
-        fast_forward: simulates frames between keyframes quickly (`World.fast_forward`); None: every frame is returned.
-            A checkpoint leaves it out.
-
-    Attributes:
-        aligns: whether the network is aligned before the current frame is estimated: it is the first one of the second
-            half of the station keeping after a track.
-        n_skipped: number of frames that `fast_forward` simulated in the last step.
-        further_path: called with the last reference and the end of the path after its last track; returns the path of
-            one more track, () for none.
-        pace_factor: factor of the pace along the path, above 0 to 1, which is approached smoothly.
+    `fast_forward` simulates frames between keyframes quickly (`World.fast_forward`); without, every frame is returned.
+    A checkpoint leaves it out.
     """
 
     def __init__(self, mission: Mission, world: World, fast_forward: FastForward | None = None):
@@ -45,9 +60,12 @@ class Flight:
         self.fast_forward, self._n_parts = fast_forward, 0
         self._mission = mission  # with the heights that the path has now
         self._change, self._is_changed = PathChange(np.zeros(3), np.zeros(3), 0), False
-        self.pace_factor = self._factor = 1.0
-        self.aligns, self.n_skipped = False, 0
-        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = _no_further_path
+        self.pace_factor = self._factor = 1.0  #: of the pace along the path, above 0 to 1, which is approached smoothly
+        #: whether the network is aligned before this frame, the first of the second half of the station keeping
+        self.aligns = False
+        self.n_skipped = 0  #: number of frames that `fast_forward` simulated in the last step
+        #: path of one more track after the last reference and the end of the path, () for none
+        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = lambda last, end: ()
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"fast_forward": None}
@@ -100,14 +118,10 @@ class Flight:
     def step(self, command: Array, pace: Pace = FULL, keyframe: bool | None = None) -> Frame | None:
         """Moves the vehicle for one frame interval and returns the next frame; None after the last frame of the plan.
 
-        Args:
-            command: (n,) thruster commands in [-1, 1], or velocity (3,) in the world [m/s] of a kinematic vehicle.
-            pace: pace along the planned path from this frame to the next; no effect during station keeping.
-            keyframe: whether the next frame is a keyframe, with both images; None: as planned.
-
-        Raises:
-            RuntimeError: an earlier call returned None.
-            SurveyAborted: the command is not finite, or the physics diverged.
+        The commands (n,) of the thrusters are in [-1, 1], or the velocity (3,) in the world [m/s] of a kinematic
+        vehicle; `pace` has no effect during station keeping; the next frame is a keyframe, with both images, as planned
+        or as given. Raises SurveyAborted if the command is not finite, or the physics diverged, and RuntimeError if an
+        earlier call returned None.
         """
         if self._k == len(self._sequence):
             raise RuntimeError("all frames of the plan have been flown; reset starts another flight")

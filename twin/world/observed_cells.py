@@ -22,14 +22,11 @@ class Coverage:
     left image, both cameras see these points, and there is no depth edge between them. With `top_m` (rows, cols), the
     true height of the surface seen from above [m], the quad must not lie more than the side of a cell below it;
     without, there are no overhangs.
-
-    Attributes:
-        seen: (rows, cols) bool, whether each cell was observed; modified in place by `add`.
     """
 
     def __init__(self, grid: MapGrid, rig: StereoRig, top_m: NDArray[np.float32] | None = None) -> None:
         self.grid, self.rig, self._top_m = grid, rig, top_m
-        self.seen = np.zeros((grid.rows, grid.cols), dtype=np.bool_)
+        self.seen = np.zeros((grid.rows, grid.cols), dtype=np.bool_)  #: whether each cell was observed
 
     def add(self, world_from_left: Array, depth_left: NDArray[np.float32], depth_right: NDArray[np.float32]) -> None:
         """Marks the cells that are observed in a keyframe, from true depths (h, w) along the optical axis [m]."""

@@ -310,7 +310,11 @@ def _check_thrust_in(
 def climb_slope(vehicle: VehicleConfig, speed_mps: float) -> float:
     """Returns the greatest slope of a path: a share of that which saturates a thruster, at most _MAX_SLOPE."""
     ahead = np.array([speed_mps, 0.0, 0.0])
-    excess = lambda climb: _load(vehicle, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731
+
+    def excess(climb: float) -> float:
+        velocities = np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]
+        return float(thrust_loads(vehicle, velocities).max()) - 1
+
     if excess(0.0) >= 0:
         return _MAX_SLOPE  # `prepare` reports that the speed is too high
     high = _MAX_SLOPE / _CLIMB_SHARE * speed_mps
@@ -325,10 +329,6 @@ def _saturating_factor(load: Callable[[float], float]) -> float | None:
 
 def _root(function: Callable[[float], float], high: float) -> float:
     return float(root_scalar(function, bracket=(0.0, high), method="brentq", xtol=1e-4).root)
-
-
-def _load(vehicle: VehicleConfig, velocities: Array) -> float:
-    return float(thrust_loads(vehicle, velocities).max(initial=0.0))
 
 
 def body_velocities(yaw: Array, velocity: Array) -> Array:

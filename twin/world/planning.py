@@ -61,7 +61,8 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     if scenario.plan.height == "floor" or scenario.control.height != "planned":
         request = request._replace(surface=_surface(scenario, request, plan.area, terrain))
         plan = _PATTERNS[pattern](request)
-    if scenario.plan.overlap_reference == "floor" and _lies_above(plan, terrain):
+    x, y, z = plan.outline().T
+    if scenario.plan.overlap_reference == "floor" and (terrain.height_at(x, y) < z).all():
         plan = _over_floor(plan, pattern, terrain, scenario.believed_rig())
         check_plan_size(plan, scenario.control.hold_s)
     return _with_tasks(scenario, plan, terrain)
@@ -172,11 +173,6 @@ def _turn_radius_m(asked: PlanConfig, vehicle: VehicleConfig) -> float:
 def _lies_over(plan: SurveyPlan, terrain: Terrain) -> bool:
     inside = bool(np.isfinite(terrain.height_at(*plan.outline()[:, :2].T)).all())
     return inside and (terrain.known is None or not hole_part(plan, terrain).too_far)
-
-
-def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
-    x, y, z = plan.outline().T
-    return bool((terrain.height_at(x, y) < z).all())
 
 
 def _surface(scenario: Scenario, request: SurveyRequest, area: SurveyArea, terrain: Terrain) -> CameraSurface:

@@ -7,7 +7,7 @@ from pydantic import BaseModel
 
 from twin.errors import TwinError
 from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
-from twin.scenario.model import FAULTS, Scenario, SensorConfig, SnowConfig, TerrainConfig
+from twin.scenario.model import FAULTS, SENSORS, Scenario, SensorConfig, SnowConfig, TerrainConfig
 from twin.simulate.parameters import moves_along_all_axes
 
 _IN_IMAGES = ("cameras", "left_camera", "right_camera", "lamp", "fish")  # parts whose faults change images, as silt
@@ -193,7 +193,7 @@ def _of_faults(scenario: Scenario) -> Iterator[TwinError]:
         if fault.part == "tether" and (not scenario.tether.length_m or kinematic or fault.size <= 0):
             problem = "needs a tether, a rigid vehicle and a slack above 0"
             yield TwinError(f"{key}.part", problem, "tether.length_m and size above 0")
-        if fault.part in ("pressure", "ahrs", "dvl", "usbl") and fault.part not in scenario.navigation.aiding:
+        if fault.part in SENSORS and fault.part not in scenario.navigation.aiding:
             yield TwinError(f"{key}.part", f"{fault.part} is not used", "a sensor in navigation.aiding")
         when = [name for name in ("start_s", "at_m", "per_hour") if getattr(fault, name) is not None]
         if len(when) != 1:

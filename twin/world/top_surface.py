@@ -129,18 +129,14 @@ def true_albedo(terrain: Terrain, grid: MapGrid) -> NDArray[np.float32]:
         for left in range(0, grid.cols, side):
             part = out[top : top + side, left : left + side]
             of_cols, of_rows = slice(left * n, (left + side) * n), slice(top * n, (top + side) * n)
-            fine = _samples(terrain.texture, *np.meshgrid(col[of_cols], row[of_rows]))
+            source = _cropped(terrain.texture, *np.meshgrid(col[of_cols], row[of_rows]))
+            fine = np.asarray(cv2.remap(*source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
             paint_walls_from_above(terrain, walls, fine, x[of_cols], y[of_rows], step_m)
             part[:] = fine.reshape(len(part), n, -1, n, 3).mean(axis=(1, 3), dtype=np.float32)
     inside_x = (x[n // 2 :: n] >= terrain.west_m) & (x[n // 2 :: n] <= terrain.east_m)
     inside_y = (y[n // 2 :: n] >= terrain.south_m) & (y[n // 2 :: n] <= terrain.north_m)
     out[~(inside_y[:, None] & inside_x)] = np.nan
     return out
-
-
-def _samples(texture: Image, across: Layer, down: Layer) -> Image:
-    resampled = cv2.remap(*_cropped(texture, across, down), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(resampled, np.uint8)
 
 
 def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | None, map_grid: MapGrid) -> Layer:

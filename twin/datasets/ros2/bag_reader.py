@@ -9,7 +9,7 @@ import numpy as np
 from twin.core.records import Trajectory
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_error
-from twin.datasets.ros2.bag import Bag, BagMessage, is_bag
+from twin.datasets.ros2.bag import Bag, is_bag
 from twin.datasets.ros2.bag_images import BagImage, StereoTopics, image_topics, stereo_topics
 from twin.datasets.ros2.bag_readings import read_bag
 from twin.datasets.ros2.camera_info import stereo_calibration
@@ -55,7 +55,10 @@ class BagReader:
         if any(index.values()) and all(one.stamp_ns == 0 for images in index.values() for one in images):
             notes.append("The images have no times in their headers; the times of recording were used.")
             index = {topic: [one._replace(stamp_ns=one.logged_ns) for one in found] for topic, found in index.items()}
-        left, right = (_image_times(bag, index[topic]) for topic in (topics.left, topics.right))
+        left, right = (
+            [ImageTime(one.stamp_ns * 1e-9, BagImage(bag, one)) for one in index[topic]]
+            for topic in (topics.left, topics.right)
+        )
         frames, n_right_only = pair_by_time(left, right)
         transforms, camera, truth = static_transforms(bag), _frame(bag, topics.left), None
         if self._topics.truth is not None:
@@ -80,10 +83,6 @@ class BagReader:
                 allowed = ", ".join(images) or "none in this bag"
                 raise TwinError("--topics", f"{topic[:100]!r} is not an image topic of {bag.path}", allowed)
         return StereoTopics(left, right, images[left], images[right])
-
-
-def _image_times(bag: Bag, positions: list[BagMessage]) -> list[ImageTime]:
-    return [ImageTime(one.stamp_ns * 1e-9, BagImage(bag, one)) for one in positions]
 
 
 def _frame(bag: Bag, topic: str) -> str:

@@ -52,7 +52,8 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
     velocity = _read(bag, topics[_DVL], readings.VELOCITY, _velocity, notes)
     inertial = None
     if attitude is None:
-        inertial = _read(bag, _with_motion(bag, topics[_IMU]), readings.INERTIAL, _motion, notes)
+        moving = [name for name in topics[_IMU] if any(map(_states_motion, _first(bag, name)))]
+        inertial = _read(bag, moving, readings.INERTIAL, _motion, notes)
     if inertial is not None:
         notes = [note for note in notes if not note.endswith(_NO_ORIENTATION)]
     if height is velocity is attitude is inertial is None and not notes:
@@ -112,10 +113,6 @@ def _inertial(
 
 def _first(bag: Bag, topic: str) -> Iterable[Any]:
     return (message for _, message in islice(bag.messages(topic), _N_FIRST))
-
-
-def _with_motion(bag: Bag, topics: list[str]) -> list[str]:
-    return [name for name in topics if any(_states_motion(message) for message in _first(bag, name))]
 
 
 def _states_motion(message: Any) -> bool:

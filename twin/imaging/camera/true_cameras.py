@@ -142,7 +142,10 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     margin = _margin(rays, believed_rig)
     raw_rig = replace(_enlarged(true_rig, border), focal_px=models[0].focal_px)
     left, right = (
-        SamplingMap((positions + margin).astype(np.float32), _or_none(parallax)) for positions, parallax in rays
+        SamplingMap(
+            (at + margin).astype(np.float32), parallax.astype(np.float32) if np.abs(parallax).max() > 1e-9 else None
+        )
+        for at, parallax in rays
     )
     return TrueCameras(
         _enlarged(true_rig, margin), (int(margin[0]), int(margin[1])), raw_rig, (left, right),
@@ -214,10 +217,6 @@ def _rendered_rays(camera: CameraModel, border: tuple[int, int], rig: StereoRig)
 
 def _enlarged(rig: StereoRig, border: NDArray[np.int64]) -> StereoRig:
     return replace(rig, width_px=rig.width_px + 2 * int(border[0]), height_px=rig.height_px + 2 * int(border[1]))
-
-
-def _or_none(parallax: Array) -> Positions | None:
-    return parallax.astype(np.float32) if np.abs(parallax).max() > 1e-9 else None
 
 
 def _size_px(rig: StereoRig) -> tuple[int, int]:

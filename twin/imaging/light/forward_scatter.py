@@ -51,11 +51,9 @@ class Surroundings(NamedTuple):
 class ForwardScatter:
     """Blur of the light of the floor by scattering on its way to the camera.
 
-    Attributes:
-        range_per_depth: range divided by depth of the pixels of the surroundings.
-        surroundings: grid on which `add` expects the light of the floor around the image.
-        kept: (SHARE_STEPS + 1, 4) share of the light that arrives without blur (unscattered, or scattered by less than
-            a pixel), for R, G, B and a zero, at even steps of r / (r + RANGE_SCALE_M).
+    `range_per_depth` is that of the pixels of the `surroundings`, the grid on which `add` expects the light of the
+    floor around the image; `kept` (SHARE_STEPS + 1, 4) the share of the light that arrives without blur (unscattered,
+    or scattered by less than a pixel), for R, G, B and a zero, at even steps of r / (r + RANGE_SCALE_M).
     """
 
     def __init__(self, rig: StereoRig, water: Medium):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -12,24 +13,7 @@ CELLS = 4096  # number of cells of a table
 _GAUSS = np.polynomial.legendre.leggauss(6)
 MOLECULAR_PER_M, MOLECULAR_NM, MOLECULAR_EXPONENT = 0.00288, 500.0, 4.32  # see `molecular_scattering_per_m`
 
-#: Phase function of Petzold's average particle: angle [deg], density [1/sr]. Mean of the volume scattering functions
-#: that Petzold (1972, SIO Ref. 72-78) measured in San Diego Harbor (NUC 2200, 2040, 2240), each without the share of
-#: the water molecules and divided by its scattering coefficient, as defined by Mobley et al. (1993, Appl. Opt. 32,
-#: 7484). At smaller angles the report extends the first values as a power of the angle.
-PETZOLD = (
-    (0.1, 1.7782e3), (0.1259, 1.3039e3), (0.1585, 9.5648e2), (0.1995, 7.0369e2), (0.2512, 5.1705e2),
-    (0.3162, 3.7882e2), (0.3981, 2.7819e2), (0.5012, 2.0247e2), (0.631, 1.4533e2), (0.7943, 1.0293e2),
-    (1.0, 7.2081e1), (1.2589, 4.9910e1), (1.5849, 3.4173e1), (1.9953, 2.2958e1), (2.5119, 1.5258e1),
-    (3.1623, 1.0083e1), (3.9811, 6.6236e0), (5.0119, 4.3250e0), (6.3096, 2.8256e0), (7.9433, 1.8309e0),
-    (10.0, 1.1602e0), (15.0, 4.9259e-1), (20.0, 2.4597e-1), (25.0, 1.4808e-1), (30.0, 8.6626e-2),
-    (35.0, 5.9681e-2), (40.0, 4.2354e-2), (45.0, 3.0854e-2), (50.0, 2.2893e-2), (55.0, 1.7089e-2),
-    (60.0, 1.3202e-2), (65.0, 1.0515e-2), (70.0, 8.5297e-3), (75.0, 7.0078e-3), (80.0, 5.8677e-3),
-    (85.0, 4.9724e-3), (90.0, 4.3079e-3), (95.0, 3.7935e-3), (100.0, 3.4136e-3), (105.0, 3.1222e-3),
-    (110.0, 2.9172e-3), (115.0, 2.8005e-3), (120.0, 2.6878e-3), (125.0, 2.5721e-3), (130.0, 2.4749e-3),
-    (135.0, 2.3743e-3), (140.0, 2.3253e-3), (145.0, 2.3082e-3), (150.0, 2.3589e-3), (155.0, 2.5006e-3),
-    (160.0, 2.6568e-3), (165.0, 2.8302e-3), (170.0, 3.0275e-3), (175.0, 3.0885e-3), (180.0, 3.1509e-3),
-)  # fmt: skip
-#: Integral of these values over the sphere with log-log interpolation; Petzold's own rule of integration gives 1.
+#: Integral of `petzold.csv` over the sphere with log-log interpolation; Petzold's own rule of integration gives 1.
 PETZOLD_INTEGRAL = 0.997385
 
 
@@ -74,8 +58,9 @@ def molecular_scattering_per_m(wavelength_nm: Array) -> Array:
 
 
 def petzold(angle: Array) -> Array:
-    """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of the table `PETZOLD`."""
-    log_angle, log_density = np.log(np.deg2rad([row[0] for row in PETZOLD])), np.log([row[1] for row in PETZOLD])
+    """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of `petzold.csv`."""
+    degrees, density = np.loadtxt(Path(__file__).parent / "petzold.csv", delimiter=",", unpack=True)
+    log_angle, log_density = np.log(np.deg2rad(degrees)), np.log(density)
     wanted = np.log(np.maximum(angle, 1e-12))
     slope = (log_density[1] - log_density[0]) / (log_angle[1] - log_angle[0])
     below = np.minimum(wanted - log_angle[0], 0.0) * slope

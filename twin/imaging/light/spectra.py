@@ -13,6 +13,7 @@ the absorption lies between those of 1C and 7C as at the last wavelength with a 
 import importlib
 import warnings
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -28,6 +29,7 @@ NM.setflags(write=False)
 #: Centres and standard deviations of the bands R, G, B [nm].
 CENTRE_NM = (600.0, 535.0, 460.0)
 WIDTH_NM = (30.0, 38.0, 30.0)
+_LED_B5 = Path(__file__).parent / "led_b5.csv"
 
 
 def sensitivity() -> Array:
@@ -61,21 +63,11 @@ def jerlov_package() -> Any:
 
 Light = Literal["led", "daylight"]
 
-#: Relative power of CIE illuminant LED-B5 (blue with phosphor, 6598 K), 400 to 700 nm by 5 nm (CIE 015:2018, table 12).
-LED_B5 = (
-    0.07, 0.16, 0.35, 0.78, 1.67, 3.3, 5.94, 9.92, 16.15, 25.15, 32.34, 31.18,
-    23.46, 16.39, 12.08, 9.08, 7.21, 6.48, 6.49, 7.05, 8.1, 9.45, 10.88, 12.22,
-    13.38, 14.29, 14.98, 15.48, 15.81, 16.01, 16.1, 16.13, 16.1, 15.98, 15.77, 15.5,
-    15.15, 14.76, 14.31, 13.79, 13.22, 12.59, 11.91, 11.2, 10.47, 9.73, 9.0, 8.27,
-    7.57, 6.9, 6.25, 5.65, 5.08, 4.55, 4.06, 3.61, 3.22, 2.86, 2.54, 2.26,
-    2.0,
-)  # fmt: skip
-
 
 @cache
 def spectrum_of(light: Light) -> Array:
     """Returns the relative power (n,) at `NM` of CIE illuminant LED-B5 ("led") or D65 ("daylight")."""
-    nm, power = (np.arange(400.0, 701.0, 5.0), LED_B5) if light == "led" else jerlov_package().d65()
+    nm, power = np.loadtxt(_LED_B5, delimiter=",", unpack=True) if light == "led" else jerlov_package().d65()
     spectrum = np.interp(NM, nm, power)
     spectrum.setflags(write=False)
     return spectrum
