@@ -104,7 +104,7 @@ def change_between(first: Heights, second: Heights, scale_m: float) -> Change:
     of_maps = register(first, second, everywhere)
     weights = _weights(np.where(np.isfinite(of_maps.difference_m), of_maps.sigma_m, 0.0))
     ratio = _weighted_mean(np.nan_to_num(of_maps.difference_m), weights, side) * np.sqrt(_mean(weights, side))
-    calm = np.abs(ratio) < _CALM_Z * _normal_scale(ratio[weights > 0])
+    calm = np.abs(ratio) <= _CALM_Z * _normal_scale(ratio[weights > 0])
     change = _look((first, second), calm, everywhere, side, _CLEAN_SHARES[0])
     for clean_share in _CLEAN_SHARES[1:]:
         calm = ~np.asarray(binary_dilation(change.labels > 0, iterations=(side + 1) // 2), bool)

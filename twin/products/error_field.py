@@ -70,6 +70,8 @@ def fitted(difference_m: Layer, sigma_m: Layer, cell_m: float, stable: Layer) ->
     if used.sum() < LEAST_CELLS:
         raise TwinError("RUN2", f"has {used.sum()} unchanged cells in common with RUN1", f"at least {LEAST_CELLS}")
     extent, z = max(known.shape), np.where(used, difference_m / sigma, 0.0)
+    if not z.any():
+        raise TwinError("RUN2", "its map equals that of RUN1", "another survey")
     curve = _autocovariance(z, used.astype(float))
     near = curve[:, curve[0] < 0.1 * extent]  # rapid errors lie upon a plateau, which slow errors make
     window, _, plateau = _best_range(near, np.geomspace(1.5, 0.08 * extent, _N_RANGES), True)
@@ -139,4 +141,4 @@ def _distances(shape: tuple[int, ...]) -> Layer:
 
 
 def _padded(shape: tuple[int, ...], reach: float) -> tuple[int, ...]:
-    return tuple(12 * ((n + int(reach) + 12) // 12) for n in shape)  # divisible: fast to transform
+    return tuple(12 * ((n + min(int(reach), n) + 12) // 12) for n in shape)  # divisible: fast to transform
