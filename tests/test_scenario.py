@@ -24,8 +24,8 @@ PLAN_KEYS = (
     "clearance_m"
 )
 TOP_KEYS = (
-    "name, seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, "
-    "snow, current, waves, tether, navigation, imu, plan, control, estimate, map, beacons, objects, tasks, "
+    "name, seed, scene_seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, "
+    "lamps, sun, snow, current, waves, tether, navigation, imu, plan, control, estimate, map, beacons, objects, tasks, "
     "faults, require"
 )
 SENSOR_KEYS = (

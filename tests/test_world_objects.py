@@ -124,3 +124,70 @@ def test_the_true_albedo_is_unknown_where_an_object_covers_the_floor() -> None:
     albedo = without_objects(np.ones((8, 8, 3), np.float32), grid, objects, map_grid)
     assert np.isnan(albedo[:2, 6:]).all() and np.isnan(albedo).sum() == 2 * 2 * 3
     assert without_objects(albedo, grid, None, map_grid) is albedo
+
+
+REEF = """
+seed = 1
+[terrain]
+kind = "reef"
+size_m = [6.0, 5.0]
+grid_m = 0.1
+[imaging]
+fidelity = "surrogate"
+[plan]
+area_m = [2.0, 1.0]
+[[objects]]
+shape = "boulder"
+per_m2 = 0.3
+area_m = [4.0, 3.0]
+size_spread = 0.3
+[[objects]]
+shape = "crate"
+position_m = [0.5, 0.2]
+"""
+
+
+def objects_of(folder, *overrides):
+    (folder / "reef.toml").write_text(REEF)
+    return prepare(load_scenario(folder / "reef.toml", overrides))
+
+
+def test_objects_grow_about_their_base_or_are_gone_and_all_others_stay_where_they_are(tmp_path):
+    before = objects_of(tmp_path).objects
+    after = objects_of(
+        tmp_path, "objects.0.growth_m=0.02", "objects.0.growing=[1]", "objects.0.removed=[2]", "seed=7", "scene_seed=1"
+    ).objects
+    boulders = [k for k, item in enumerate(before) if item.group == 0]
+    grown, gone = boulders[1], boulders[2]
+    assert len(boulders) >= 3 and before[boulders[0]].radius_m >= before[grown].radius_m
+    assert len(after) == len(before) - 1
+    for number, item in enumerate(before):
+        if number == gone:
+            continue
+        same = after[number - (number > gone)]
+        np.testing.assert_array_equal(same.world_from_object[:3, 3], item.world_from_object[:3, 3])
+        rise_m = (same.scale - item.scale) * item.model.high_m[2]
+        assert rise_m == pytest.approx(0.02 if number == grown else 0.0)
+
+
+def test_two_surveys_of_one_scene_have_the_same_floor_and_objects(tmp_path):
+    first, second = objects_of(tmp_path), objects_of(tmp_path, "seed=7", "scene_seed=1")
+    np.testing.assert_array_equal(first.terrain.height_m, second.terrain.height_m)
+    np.testing.assert_array_equal(first.terrain.texture, second.terrain.texture)
+    other = objects_of(tmp_path, "seed=7")
+    assert not np.array_equal(first.terrain.height_m, other.terrain.height_m)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("objects.0.removed=[400]", r"objects.0.removed: 400: no such object .allowed: 0 to "),
+        ("objects.1.growing=[0]", "objects.1.growing: has no effect without growth_m"),
+        ("objects.1.growth_m=-3", r"objects.1.growth_m: -3: an object is 0.2 m high .allowed: more than -0.2"),
+        ("objects.1.growth_m=20", "objects.1.growth_m: the object reaches beyond the terrain"),
+        ("objects.0.removed=[-1]", "objects.0.removed.0: -1"),
+    ],
+)
+def test_changes_of_objects_that_are_not_possible_are_refused(tmp_path, override, message):
+    with pytest.raises(ScenarioError, match=message):
+        objects_of(tmp_path, override)

@@ -4,14 +4,16 @@ from typing import TYPE_CHECKING, Any
 
 from twin.api import compare, export, load_run, load_scenario, look, plan, replay, run, study, tune, vehicle
 
+from twin.api import map_change, map_products  # isort: skip
+
 if TYPE_CHECKING:
     from twin.session.stepped_world import SteppedWorld as World
 
     __version__: str
 
 __all__ = [
-    "World", "__version__", "compare", "export", "load_run", "load_scenario", "look", "plan", "replay", "run", "study",
-    "tune", "vehicle",
+    "World", "__version__", "compare", "export", "load_run", "load_scenario", "look", "map_change", "map_products",
+    "plan", "replay", "run", "study", "tune", "vehicle",
 ]  # fmt: skip
 
 

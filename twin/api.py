@@ -183,6 +183,27 @@ def compare(*runs: str | Path | RunResult) -> dict[str, Any]:
     return run_comparison.as_json(run_comparison.load_runs([_folder(run) for run in runs]))
 
 
+def map_products(run: str | Path | RunResult, level_m: float | None = None) -> dict[str, Any]:
+    """Returns rugosity, slope, area and volume of a run's map with standard deviations, as `twin products --json` does.
+
+    The volume stands on the level `level_m` [m], by default the 1st percentile of the heights. Raises TwinError if the
+    run has no map with standard deviations, or one that is too small.
+    """
+    from twin.products.pages import products_of
+
+    return products_of(_folder(run), level_m).tree
+
+
+def map_change(first: str | Path | RunResult, second: str | Path | RunResult, scale_m: float = 0.2) -> dict[str, Any]:
+    """Returns the change from one run to a later one, as `twin change --json` does.
+
+    `scale_m` is the size of the changes that are looked for [m]. Raises TwinError if the maps cannot be compared.
+    """
+    from twin.products.pages import change_of
+
+    return change_of(_folder(first), _folder(second), scale_m).tree
+
+
 def export(run: str | Path | RunResult, formats: str | Sequence[str], out: str | Path | None = None) -> dict[str, Any]:
     """Writes a run, or the planned path of a scenario, in the formats of other programs; returns the files by format.
 

@@ -25,6 +25,7 @@ from twin.core.output_folder import sole_writer
 from twin.errors import TwinError
 
 if TYPE_CHECKING:
+    from twin.products.pages import Results
     from twin.recordings.replay import ReplayResult
     from twin.report.run_result import RunResult
 
@@ -522,6 +523,38 @@ def compare(
 
 
 @app.command()
+def products(
+    folder: RunFolder,
+    level_m: Annotated[
+        float | None,
+        option("Height of the level of the volume. Default: 1st percentile of the heights.", "M", "--level"),
+    ] = None,
+    out: Annotated[Path | None, option("Folder to write. Default: RUN/products.")] = None,
+    as_json: SummaryJson = False,
+) -> None:
+    """Compute rugosity, slope, area and volume of a run's map, with their uncertainty: page, JSON file and GeoTIFFs."""
+    from twin.products.pages import products_of
+
+    _write_results(products_of(folder, level_m), out or folder / "products", as_json)
+
+
+@app.command()
+def change(
+    first: Annotated[Path, argument("Folder of the earlier run.", "RUN1")],
+    second: Annotated[Path, argument("Folder of the later run.", "RUN2")],
+    scale_m: Annotated[
+        float, option("Size of the changes that are looked for.", "M", "--scale", min=0.001, max=1000)
+    ] = 0.2,
+    out: Annotated[Path, option("Folder to write.")] = Path("runs/change"),
+    as_json: SummaryJson = False,
+) -> None:
+    """Find what has changed between two surveys of one scene, and from what size on a change would be found."""
+    from twin.products.pages import change_of
+
+    _write_results(change_of(first, second, scale_m), out, as_json)
+
+
+@app.command()
 def view(folder: RunFolder) -> None:
     """Open the recording of a run in Rerun."""
     from twin.report.recording import open_viewer
@@ -655,6 +688,12 @@ def _show(as_json: bool, tree: Any, tables: Iterable[tuple[str, list[tuple[str, 
     for title, rows in tables:
         console.print_table(title, rows)
     print(last_line)
+
+
+def _write_results(results: "Results", folder: Path, as_json: bool) -> None:
+    with _results_folder(folder, f"{results.name}.html"):
+        page = results.write(folder)
+    _show(as_json, results.tree, [], "\n".join([*results.sentences, f"Page: {page}"]))
 
 
 @contextmanager

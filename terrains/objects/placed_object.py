@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
+from twin.errors import TwinError
 from twin.terrains.objects.coloured_mesh import Mesh, extent, is_closed, standing
 from twin.terrains.objects.detail import Level, levels_of
 
@@ -44,6 +45,17 @@ class PlacedObject(NamedTuple):
         """Returns the corners (8, 3) of the bounding box in the world [m]; the box has the axes of the object."""
         corners = np.where(np.array(list(np.ndindex(2, 2, 2)), bool), self.model.high_m, self.model.low_m)
         return corners @ self.world_from_object[:3, :3].T + self.world_from_object[:3, 3]
+
+
+def grown(item: PlacedObject, growth_m: float, field: str) -> PlacedObject:
+    """Returns an object whose height has increased by `growth_m` about its base; `field` is that of the TwinError."""
+    height_m = item.scale * float(item.model.high_m[2])
+    if growth_m <= -height_m:
+        raise TwinError(field, f"{growth_m:g}: an object is {height_m:.3g} m high", f"more than {-height_m:.3g}")
+    factor = 1 + growth_m / height_m
+    pose = item.world_from_object.copy()
+    pose[:3, :3] *= factor
+    return item._replace(world_from_object=pose, scale=item.scale * factor)
 
 
 def model_of(mesh: Mesh, sways: bool = False) -> ObjectModel:

@@ -38,7 +38,7 @@ def place(
         return entry.scattered(models, taken)
     model = models[number % len(models)]
     item = entry.at(model, float(entry.scales([model])[0]), group.position_m)
-    _check_inside(item, terrain, f"objects.{number}.position_m")
+    check_inside(item, terrain, f"objects.{number}.position_m")
     return [item]
 
 
@@ -178,7 +178,7 @@ def _tilt(terrain: Terrain, x: float, y: float, reach_m: float) -> Array:
     return np.eye(3) + skew + skew @ skew / (1 + normal[2])
 
 
-def _check_inside(item: PlacedObject, terrain: Terrain, field: str) -> None:
+def check_inside(item: PlacedObject, terrain: Terrain, field: str) -> None:
     corners = item.corners_m()
     low, high = corners.min(axis=0), corners.max(axis=0)
     inside = low[0] >= terrain.west_m and low[1] >= terrain.south_m

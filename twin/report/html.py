@@ -23,9 +23,9 @@ def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
     return _for_narrow_screens(_rendered(package, template, context, autoescape=True))
 
 
-def render_text(template: str, context: Mapping[str, Any]) -> str:
-    """Returns a template of this package rendered as text; missing variables are dashes."""
-    return _rendered(_SHARED_TEMPLATES, template, context, undefined=jinja2.ChainableUndefined)
+def render_text(template: str, context: Mapping[str, Any], package: str = _SHARED_TEMPLATES) -> str:
+    """Returns a template of a package, by default this, rendered as text; missing variables are dashes."""
+    return _rendered(package, template, context, undefined=jinja2.ChainableUndefined)
 
 
 def _rendered(package: str, template: str, context: Mapping[str, Any], **options: Any) -> str:

@@ -50,7 +50,7 @@ def plan_view(run: Run) -> Figure | None:
     if not run.trajectories:
         return None
     figure, axes = one_panel(5.2)
-    _map_axes(axes, run)
+    map_axes(axes, run)
     if "dem_truth" in run.rasters:
         floor = run.rasters["dem_truth"]
         axes.imshow(hillshade(subsampled(floor), "gray"), extent=extent_of(floor.grid), alpha=0.35)
@@ -174,7 +174,7 @@ def elevation_maps(run: Run) -> Figure | None:
     figure = Figure(figsize=(WIDTH_IN, 4.0))
     panels = figure.subplots(1, len(rasters), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (raster, title) in zip(panels, rasters, strict=True):
-        _map_axes(axes, run).imshow(hillshade(subsampled(raster), "viridis", scale), extent=extent_of(raster.grid))
+        map_axes(axes, run).imshow(hillshade(subsampled(raster), "viridis", scale), extent=extent_of(raster.grid))
         axes.set_title(title)
     figure.colorbar(ScalarMappable(Normalize(*scale), "viridis"), ax=panels, label="height [m]", shrink=0.8)
     return figure
@@ -188,10 +188,10 @@ def error_maps(run: Run) -> Figure | None:
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     limit = float(np.nanpercentile(np.abs(run.rasters["dem_error"].values), 98)) or 1e-3
     title = "Height error (estimated minus true)"
-    _scalar_map(_map_axes(left, run), run.rasters["dem_error"], title, "RdBu_r", Normalize(-limit, limit))
+    scalar_map(map_axes(left, run), run.rasters["dem_error"], title, "RdBu_r", Normalize(-limit, limit))
     if "dem_sigma" in run.rasters:
         title = "Estimated standard deviation (sigma)"
-        _scalar_map(_map_axes(right, run), run.rasters["dem_sigma"], title, "magma", Normalize(0, limit))
+        scalar_map(map_axes(right, run), run.rasters["dem_sigma"], title, "magma", Normalize(0, limit))
     return figure
 
 
@@ -207,23 +207,23 @@ def task_maps(run: Run) -> Figure | None:
         title = titles[number - 1] if number <= len(titles) else name
         heights, error = run.rasters[name], run.rasters.get(name.replace("/dem", "/dem_error"))
         scale = height_scale(heights.values.ravel())
-        _map_axes(row[0], run).imshow(hillshade(subsampled(heights), "viridis", scale), extent=extent_of(heights.grid))
+        map_axes(row[0], run).imshow(hillshade(subsampled(heights), "viridis", scale), extent=extent_of(heights.grid))
         row[0].set_title(title)
         figure.colorbar(ScalarMappable(Normalize(*scale), "viridis"), ax=row[0], label="height [m]", shrink=0.8)
         if error is not None and np.isfinite(error.values).any():
             limit = float(np.nanpercentile(np.abs(error.values), 98)) or 1e-3
-            _scalar_map(_map_axes(row[1], run), error, "Height error", "RdBu_r", Normalize(-limit, limit))
+            scalar_map(map_axes(row[1], run), error, "Height error", "RdBu_r", Normalize(-limit, limit))
     return figure
 
 
-def _scalar_map(axes: Axes, raster: Raster, title: str, cmap: str, norm: Normalize) -> None:
+def scalar_map(axes: Axes, raster: Raster, title: str, cmap: str, norm: Normalize, unit: str = "m") -> None:
     """Draws a raster with one band and its colour bar; cells without data are light grey."""
     image = axes.imshow(subsampled(raster), cmap=cmap, norm=norm, extent=extent_of(raster.grid))
     axes.set_title(title)
     axes.set_facecolor("#dfe6ea")
     figure = axes.get_figure()
     assert figure is not None
-    figure.colorbar(image, ax=axes, label="[m]", shrink=0.8, extend="both" if norm.vmin else "max")
+    figure.colorbar(image, ax=axes, label=f"[{unit}]", shrink=0.8, extend="both" if norm.vmin else "max")
 
 
 def error_histogram(run: Run) -> Figure | None:
@@ -251,7 +251,7 @@ def network_plot(run: Run) -> Figure | None:
     if len(positions) == 0:
         return None
     figure, axes = one_panel(4.4)
-    _map_axes(axes, run)
+    map_axes(axes, run)
     axes.set_adjustable("datalim")  # a network along a line fills the figure too
     ends = np.pad(positions[edges][:, :, :2], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)  # a gap after each link
     axes.plot(*ends.reshape(-1, 2).T, color=COLOURS["link"], linewidth=0.5, alpha=0.6)
@@ -284,7 +284,7 @@ def subsampled(raster: Raster) -> np.ndarray:
     return raster.values[::step, ::step]
 
 
-def _map_axes(axes: Axes, run: Run) -> Axes:
+def map_axes(axes: Axes, run: Run) -> Axes:
     axes.set_aspect("equal")
     axes.grid(visible=False)
     axes.set(xlabel="east [m]", ylabel="north [m]")

@@ -62,6 +62,7 @@ WhiteGain = Annotated[Number, Field(ge=1, le=16)]
 Latency = Annotated[Number, Field(ge=0, le=5)]
 BlurPx = Annotated[Number, Field(ge=0, le=2)]
 LateralColour = Annotated[Number, Field(ge=-0.02, le=0.02)]
+ObjectNumber = Annotated[int, Field(ge=0, lt=20_000)]
 Albedo = Annotated[Number, Field(ge=0, le=1)]
 RelativeIntensity = Annotated[Number, Field(ge=0, le=100)]
 
@@ -1011,6 +1012,13 @@ class ObjectConfig(Section):
     spacing_m: float = Field(default=0.0, ge=0, le=1000)
     """least distance from the centre of a scattered object to the centres of all objects placed before it, those of
     other entries too (Poisson disc); scattered objects never overlap any object [m]"""
+    growth_m: float = Field(default=0.0, ge=-20, le=20)
+    """growth since an earlier survey: increase of the height of the objects, which keep their base and proportions; all
+    positions are those of the objects before they grew [m]"""
+    growing: tuple[ObjectNumber, ...] | None = None
+    """numbers of the objects of this entry that grow, from 0 for the largest; default: all"""
+    removed: tuple[ObjectNumber, ...] = ()
+    """numbers of the objects of this entry that are gone since an earlier survey, from 0 for the largest"""
 
 
 class TaskConfig(Section):
@@ -1191,6 +1199,9 @@ class Scenario(Section):
     """name of the survey"""
     seed: int = Field(default=0, ge=0, lt=2**32)
     """seed of all random numbers"""
+    scene_seed: int | None = Field(default=None, ge=0, lt=2**32)
+    """seed of the floor, its texture and the objects; default: seed. Two surveys of one scene have different seeds and
+    the same scene_seed"""
     record: Literal["none", "keyframes", "all"] = "keyframes"
     """images that the run folder keeps, for `twin export` and the report. keyframes: stereo pairs of the keyframes;
     all: also the left images of the frames between them; none: no images"""
@@ -1235,6 +1246,10 @@ class Scenario(Section):
     def source(self) -> Source:
         """Returns the files and overrides from which the scenario was read, with line numbers, for error messages."""
         return self._source
+
+    @property
+    def seed_of_scene(self) -> int:
+        return self.seed if self.scene_seed is None else self.scene_seed
 
     @property
     def delivers_linear_images(self) -> bool:

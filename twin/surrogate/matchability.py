@@ -351,7 +351,7 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
         return _painted_centre(scenario, terrain, extent_m)
     extent_m = float(min(max(extent_m, 4 * t.grid_m), *t.size_m))
     source = terrains.TextureSource(scenario.texel_m, cover=t.cover, coarsen=True)
-    generated = _generated(t.kind, (extent_m, extent_m), t.relief_m, t.base_m, t.grid_m, source, scenario.seed)
+    generated = _generated(t.kind, (extent_m, extent_m), t.relief_m, t.base_m, t.grid_m, source, scenario.seed_of_scene)
     return generated.texture, generated.texture_px_m
 
 
@@ -367,7 +367,7 @@ def _painted_centre(scenario: Scenario, terrain: terrains.Terrain, extent_m: flo
     texel_m = terrains.TextureSource(scenario.texel_m, coarsen=True).texel_m((size_m[0], size_m[1]))
     shape = texture_shape(height_m.shape, terrain.spacing_m, texel_m)
     cover = scenario.terrain.cover or DEFAULT_COVERS["file"]
-    return generate_texture(cover, height_m, shape, texel_m, np.random.default_rng(scenario.seed)), texel_m
+    return generate_texture(cover, height_m, shape, texel_m, np.random.default_rng(scenario.seed_of_scene)), texel_m
 
 
 def _albedo(texture: Image, texel_m: float, rig: StereoRig, depth_m: float) -> Image:

@@ -27,16 +27,16 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
             in_images=rendered or t.texture_file is not None or t.orthophoto_file is not None,
         )  # fmt: skip
         assert t.height_file is not None  # `scenario_checks.floor_contradictions`
-        return terrains.load(t.height_file, texture, t.height_spacing_m, t.height_range_m, scenario.seed, t.z)
+        return terrains.load(t.height_file, texture, t.height_spacing_m, t.height_range_m, scenario.seed_of_scene, t.z)
     texture = terrains.TextureSource(
         scenario.texel_m if rendered else t.grid_m, cover=t.cover, coarsen=t.texture_px_m is None,
         walls=scenario.has_walls,
     )  # fmt: skip
     if (plugin := t.plugin) is None:
-        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texture, scenario.seed)
+        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texture, scenario.seed_of_scene)
     return terrains.generate_from(
-        lambda x_m, y_m, _: terrain_heights(plugin, x_m, y_m, scenario.seed),
-        t.size_m, t.grid_m, texture, t.cover or DEFAULT_COVERS[t.kind], scenario.seed,
+        lambda x_m, y_m, _: terrain_heights(plugin, x_m, y_m, scenario.seed_of_scene),
+        t.size_m, t.grid_m, texture, t.cover or DEFAULT_COVERS[t.kind], scenario.seed_of_scene,
     )  # fmt: skip
 
 

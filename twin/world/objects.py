@@ -1,6 +1,7 @@
 """Objects of a scenario: loaded or built, and placed on the floor."""
 
 import zlib
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,8 +12,8 @@ from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario
 from twin.terrains.objects.built_models import built_model
 from twin.terrains.objects.mesh_file import read_mesh
-from twin.terrains.objects.placed_object import ObjectModel, PlacedObject, model_of
-from twin.terrains.objects.scattering import place
+from twin.terrains.objects.placed_object import ObjectModel, PlacedObject, grown, model_of
+from twin.terrains.objects.scattering import check_inside, place
 from twin.terrains.objects.shapes import SHAPES
 from twin.world.scenario_checks import keys_without_effect
 
@@ -34,8 +35,27 @@ def load_objects(scenario: Scenario, terrain: terrains.Terrain, attempt: Attempt
     for scattered in (False, True):  # scattered objects avoid those at given positions
         for number, config in enumerate(scenario.objects):
             if (config.position_m is None) == scattered:
-                attempt(lambda k=number, c=config: found.extend(_entry(k, c, models, found, (terrain, scenario.seed))))
-    return tuple(found)
+                ground = terrain, scenario.seed_of_scene
+                attempt(lambda k=number, c=config, g=ground: found.extend(_entry(k, c, models, found, g)))
+    later: list[PlacedObject] = []
+    count: Counter[int] = Counter()
+    for item in found:  # after all are placed, so that a change moves no other object
+        config, number = scenario.objects[item.group], count[item.group]
+        attempt(lambda i=item, c=config, n=number: later.extend(_changed(i, c, n, terrain)))
+        count[item.group] += 1
+    return tuple(later)
+
+
+def _changed(item: PlacedObject, config: ObjectConfig, number: int, terrain: terrains.Terrain) -> list[PlacedObject]:
+    """Returns an object as it is at the time of the survey, with its number in its entry; [] if it is gone."""
+    if number in config.removed:
+        return []
+    if not config.growth_m or (config.growing is not None and number not in config.growing):
+        return [item]
+    field = f"objects.{item.group}.growth_m"
+    item = grown(item, config.growth_m, field)
+    check_inside(item, terrain, field)
+    return [item]
 
 
 def _entry(
@@ -58,7 +78,17 @@ def _entry(
     items = place(number, sized, models[key], terrain, found, seed)
     if len(found) + len(items) > MAX_OBJECTS:
         raise TwinError(f"objects.{number}", f"{len(found) + len(items)} objects", f"at most {MAX_OBJECTS} objects")
+    _check_numbers(f"objects.{number}", config, len(items))
     return items
+
+
+def _check_numbers(path: str, config: ObjectConfig, n_objects: int) -> None:
+    if config.growing is not None and not config.growth_m:
+        raise TwinError(f"{path}.growing", "has no effect without growth_m", "a growth_m, or without it")
+    for key, numbers in (("growing", config.growing or ()), ("removed", config.removed)):
+        for number in numbers:
+            if number >= n_objects:
+                raise TwinError(f"{path}.{key}", f"{number}: no such object", f"0 to {n_objects - 1}")
 
 
 def _models(number: int, config: ObjectConfig, seed: int, variant: int | None) -> tuple[ObjectModel, ...]:
