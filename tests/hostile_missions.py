@@ -17,8 +17,10 @@ import json
 import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import nullcontext
 from multiprocessing import get_context
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -26,6 +28,7 @@ import numpy as np
 import twin
 from twin import survey
 from twin.errors import TwinError
+from twin.world.rendered_world import RenderedWorld
 
 MAX_SIGMAS, MAX_MAP_SIGMAS, MIN_COMPLETENESS, N_ORDINARY = 4.0, 4.0, 0.9, 60
 SHORT = ("plan.area_m=[2.0,1.0]", "plan.tracks=1")
@@ -33,6 +36,9 @@ SHORT = ("plan.area_m=[2.0,1.0]", "plan.tracks=1")
 #: motions across the optical axis, scaling focal length and depths.
 UNOBSERVABLE = ("baseline error 5 %", "focal length error 2 %")
 FLOOR_FILE = ("terrain.kind=file", "terrain.height_file={folder}/floor.npy", "terrain.height_spacing_m=0.04")
+CROSS_LINE = ("plan.cross_lines=1", "plan.cross_rise_m=0.6")
+ALL_SENSORS = 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
+VISION_ALONE = "navigation.aiding=[]"
 SUN = ("lamps=[]", "sun.illuminance_lx=20000", "sun.depth_m=5")
 
 
@@ -47,7 +53,15 @@ def fault(part, type_, duration_s=None, **keys):
     keys = {"part": f'"{part}"', "type": f'"{type_}"', "start_s": 4.0, **keys}
     keys |= {} if duration_s is None else {"duration_s": duration_s}
     text = ",".join(f"{key}={value}" for key, value in keys.items() if value is not None)
-    return f"faults=[{{{text}}}]", 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
+    return f"faults=[{{{text}}}]", ALL_SENSORS
+
+
+def principal_points(left_px, right_px):
+    """Returns the overrides for errors of both principal points [px]."""
+    return tuple(
+        f"calibration_error.{side}_principal_point_error_px={error_px}"
+        for side, error_px in (("left", left_px), ("right", right_px))
+    )
 
 
 FAULTS = {
@@ -125,6 +139,92 @@ HOSTILE = {
     "current 0.3 m/s upward": ("current.velocity_mps=[0,0,0.3]",),
     "gusts of 0.2 m/s": ("current.velocity_mps=[0.2,0.1,0]", "current.gust_mps=0.2"),
     "waves of 1 m over 8 m": ("waves.height_m=1.0", "waves.period_s=6", "waves.depth_m=8"),
+    "field of view 140 deg": ("rig.hfov_deg=140",),
+    "both principal points 8 px": principal_points([8, 0], [8, 0]),
+    "JPEG quality 12": ("images=jpeg_12",),
+    "kelp in a current": ('objects=[{shape="kelp",size_m=0.8,per_m2=1}]', "current.velocity_mps=[0.1,0.25,0]"),
+    # optics
+    "field of view 110 deg": ("rig.hfov_deg=110",),
+    "k2 error 0.1": ("calibration_error.k2_error=0.1",),
+    "k1 and k2 errors that cancel": ("calibration_error.k1_error=0.03", "calibration_error.k2_error=-0.12"),
+    "out of focus": ("lens.focus_m=0.4", "sensor.f_number=1.4"),
+    "lateral colour 1 %": ("lens.lateral_colour=[0.01,-0.01]", "lens.blur_px=[1.5,0.5,1.5]"),
+    "domes off centre": ("port.offset_m=[0.004,0.003,0.004]", "port.calibrated_at_m=0"),
+    "flat ports, tilted": ("port.kind=flat", "port.tilt_deg=6"),
+    "flat ports, calibrated at 0.6 m": ("port.kind=flat", "port.calibrated_at_m=0.6"),
+    "rolling shutter in gusts": ("rig.model=gopro_pair", "current.gust_mps=0.15"),
+    # calibration
+    "both principal points 5 px forward": principal_points([0, 5], [0, 5]),
+    "both principal points 3 px across": principal_points([3, 0], [3, 0]),
+    "principal points 1.2 px apart": principal_points([0.6, 0], [-0.6, 0]),
+    "focal error -3 %, altimeter": ("calibration_error.focal_error=-0.03", "control.height=altimeter"),
+    "focal error 3 %, high cross line": ("calibration_error.focal_error=0.03", *CROSS_LINE),
+    "baseline error -2 %, DVL": ("calibration_error.baseline_error=-0.02", ALL_SENSORS),
+    "baseline and focal errors": (
+        "calibration_error.baseline_error=0.02",
+        "calibration_error.focal_error=-0.02",
+        ALL_SENSORS,
+    ),
+    "rotated in three axes": (
+        "calibration_error.right_roll_deg=0.4",
+        "calibration_error.right_pitch_deg=-0.3",
+        "calibration_error.right_yaw_deg=0.05",
+    ),
+    "yaw and k1 errors": ("calibration_error.right_yaw_deg=0.08", "calibration_error.k1_error=-0.01"),
+    "k1 error -0.01, vision alone": ("calibration_error.k1_error=-0.01", VISION_ALONE),
+    "domes off centre, vision alone": ("port.offset_m=[0.004,0.003,0.004]", "port.calibrated_at_m=0", VISION_ALONE),
+    "focal error 2 %, waves": ("calibration_error.focal_error=0.02", "waves.height_m=1.5", "waves.depth_m=8"),
+    "ZED rig, pitched": ("rig.model=bluerov2_zed", "calibration_error.right_pitch_deg=0.3"),
+    # images
+    "right camera a frame late": ("images=late",),
+    "dirt on the left port": ("images=dirt",),
+    "interlaced": ("images=interlaced",),
+    "right image a quarter as bright": ("images=dark",),
+    "images of half the resolution": ("images=halved",),
+    "right lens out of focus": ("images=soft",),
+    "hot pixels": ("images=hot",),
+    "eight grey levels": ("images=grey_8",),
+    "uncorrected vignetting": ("sensor.shading_correction=false", "sensor.vignetting_power=8"),
+    "overexposed": ("imaging.gray_level=0.95",),
+    "underexposed": ("imaging.gray_level=0.02",),
+    "motion blur": ("sensor.exposure_min_ms=30", "sensor.exposure_max_ms=30", "plan.speed_mps=0.6"),
+    # floors
+    "cliffs of 1.2 m": ("terrain.kind=cliffs", "terrain.relief_m=1.2"),
+    "level mud": ("terrain.kind=flat", "terrain.cover=mud"),
+    "shiny floor": ("terrain.specular=0.8", "terrain.specular_width_deg=5"),
+    "pipes and crates": (
+        'objects=[{shape="pipe",size_m=1.0,per_m2=0.2},{shape="crate",size_m=0.4,per_m2=0.2}]',
+        "plan.altitude_m=1.8",
+    ),
+    "branching corals": ('objects=[{shape="branching_coral",size_m=0.4,per_m2=1.5}]',),
+    "corals from 1.2 m": ('objects=[{shape="table_coral",size_m=0.4,per_m2=0.5}]', "plan.altitude_m=1.2"),
+    "half shiny floor": ("terrain.specular=0.4", "terrain.specular_width_deg=8"),
+    # water and light
+    "large flakes of snow": ("snow.density_per_m3=200", "snow.diameter_m=0.01"),
+    "one lamp beside the cameras": (
+        "lamps=[{position_m=[0.0,0.12,-0.15],intensity_cd=1500}]",
+        "water.turbidity=4",
+    ),
+    "one lamp far to port": ("lamps=[{position_m=[0.0,1.2,0.3],pan_deg=-25,intensity_cd=4000}]",),
+    "low sun and caustics": (*SUN, "sun.elevation_deg=20", "sun.caustics=0.6"),
+    # vehicle, plan and sensors
+    "altitude 5 m": ("plan.altitude_m=5",),
+    "overlap 50 %": ("plan.overlap_along=0.5",),
+    "0.9 m/s": ("plan.speed_mps=0.9",),
+    "waves and gusts, vision alone": (
+        "waves.height_m=0.5",
+        "waves.depth_m=8",
+        "current.gust_mps=0.1",
+        VISION_ALONE,
+    ),
+    "AHRS 2 deg off": fault("ahrs", "wrong", size=2, start_s=0.0),
+    "pressure 5 cm off from 10 s on": fault("pressure", "wrong", size=0.05, start_s=10.0),
+    "DVL 3 cm/s off": fault("dvl", "wrong", size=0.03, start_s=0.0),
+    "silt and fish": (
+        'faults=[{part="water",type="silt",start_s=4,size=0.6},{part="fish",type="school",start_s=4,size=12}]',
+    ),
+    "fish all the time": fault("fish", "school", size=16, start_s=0.0),
+    "cameras that freeze now and then": fault("cameras", "intermittent", size=0.1),
 }
 
 
@@ -168,15 +268,81 @@ def write_floors(folder):
         cv2.imwrite(str(folder / f"{name}.png"), np.clip(image, 0, 255).astype(np.uint8))
 
 
+def jpeg_12(image, right):
+    """Returns an image after compression as JPEG of quality 12."""
+    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 12])[1], cv2.IMREAD_COLOR)
+
+
+def dirt(image, right):
+    """Returns an image behind 40 blurred stains on the left port, which stay where they are."""
+    rng, stains = np.random.default_rng(1), np.zeros(image.shape[:2], np.float32)
+    for x, y in rng.uniform(0, 1, (40, 2)) * image.shape[1::-1]:
+        cv2.circle(stains, (int(x), int(y)), int(rng.integers(3, 10)), 0.7, -1)
+    share = cv2.GaussianBlur(stains, (0, 0), 2)[..., None]
+    return image if right else (image * (1 - share) + 90 * share).astype(np.uint8)
+
+
+def interlaced(image, right):
+    """Returns an image with every other row a pixel to the right, as of two fields."""
+    return np.where(np.arange(len(image))[:, None, None] % 2, image, np.roll(image, 1, axis=1))
+
+
+def dark(image, right):
+    return image // 4 if right else image
+
+
+def halved(image, right):
+    """Returns the image of a camera of half the resolution, enlarged to the size of the calibration."""
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return cv2.resize(half, image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def soft(image, right):
+    return cv2.GaussianBlur(image, (0, 0), 2) if right else image
+
+
+def hot(image, right):
+    """Returns an image with 400 white pixels, others in each camera."""
+    row, col = (np.random.default_rng(right).uniform(0, 1, (400, 2)) * image.shape[:2]).astype(int).T
+    image = image.copy()
+    image[row, col] = 255
+    return image
+
+
+def grey_8(image, right):
+    return image // 32 * 32 + 16
+
+
+IMAGES = {f.__name__: f for f in (jpeg_12, dirt, interlaced, dark, halved, soft, hot, grey_8)}
+
+
+def changed_images(name):
+    """Returns a context in which images are those of a function of `IMAGES`, or right ones "late" by a frame."""
+    capture = RenderedWorld.capture
+
+    def change(world, step):
+        images = capture(world, step)
+        if name == "late":
+            current = world.right_image() if images.right is None else images.right
+            earlier, world.last_right = getattr(world, "last_right", current), current
+            return images._replace(right=None if images.right is None else earlier)
+        left, right = (image if image is None else IMAGES[name](image, k) for k, image in enumerate(images[:2]))
+        return images._replace(left=left, right=right)
+
+    return patch.object(RenderedWorld, "capture", change)
+
+
 def fly(name, overrides, seed):
     """Returns the row of one survey: how it ended, its largest error and standard deviation, and what it mapped."""
     with tempfile.TemporaryDirectory() as folder:
         write_floors(Path(folder))
-        texts = [text.replace("{folder}", folder) for text in (*SHORT, *overrides)]
+        texts = [text.replace("{folder}", folder) for text in (*SHORT, *overrides) if not text.startswith("images=")]
+        changes = [changed_images(text[7:]) for text in overrides if text.startswith("images=")]
         row = {"mission": name, "seed": seed}
         try:
             scenario = twin.load_scenario("reef", [*texts, f"seed={seed}"])
-            metrics = survey.run(scenario, Path(folder) / "run", outputs=None).metrics
+            with changes[0] if changes else nullcontext():
+                metrics = survey.run(scenario, Path(folder) / "run", outputs=None).metrics
         except TwinError as error:
             return row | {"status": "refused", "reason": str(error)[:200]}
         final, check = metrics["trajectory"].get("final") or {}, metrics.get("self_check") or {}

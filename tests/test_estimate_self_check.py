@@ -178,6 +178,7 @@ def quality(**changes):
         ({"epipolar": PATTERN}, {}, "row_pattern"),
         ({"disparity_offset": DisparityOffset(-1e-3, 1e-4)}, {}, "disparity_offset"),
         ({"distortion": DistortionError(0.03, 0.002)}, {}, "distortion"),
+        ({"lasting_residuals": {"AHRS": 1.5}}, {}, "lasting_AHRS"),
         ({}, {"row_offset_px": -0.3}, "row_offset"),
         ({}, {"repetition": 0.9}, "repetition"),
     ],
@@ -245,12 +246,12 @@ def test_an_error_of_all_lengths_is_part_of_the_covariances():
 
 
 def test_a_distortion_is_a_finding_if_it_is_significant_and_larger_than_errors_of_matching():
-    """k1 changes disparities of 20.8 px at 2 m by 2 k1 times themselves: 0.6 px for k1 = 0.0144."""
+    """k1 changes disparities of 20.8 px at 2 m by 2 k1 times themselves: 0.3 px for k1 = 0.0072."""
     for found, expected in (
         ((0.02, 0.002), True),
         ((0.02, 0.006), False),
         ((-0.02, 0.002), True),
-        ((0.01, 1e-4), False),
+        ((0.007, 1e-4), False),
     ):
         result = replace(survey_result(), quality=quality(distortion=DistortionError(*found)))
         findings = check_survey(replace(result, stereo_observations=[OBSERVATION]), RIG)
@@ -266,6 +267,13 @@ def test_the_effect_of_a_row_pattern_on_positions_is_left_to_the_alignment():
     np.testing.assert_array_equal(inflated.node_cov, result.node_cov)
     known = np.isfinite(elevation.sigma_m)
     assert np.all(higher.sigma_m[known] > elevation.sigma_m[known])
+
+
+def test_heights_that_differ_between_sets_of_keyframes_are_a_finding():
+    result, elevation = replace(survey_result(), quality=quality(), stereo_observations=[OBSERVATION]), survey()[1]
+    assert check_survey(result, RIG, replace(elevation, scatter=1.9)) == []
+    (finding,) = check_survey(result, RIG, replace(elevation, scatter=2.1))
+    assert finding.check == "scatter" and "2.1 times their standard deviation" in finding.sentence
 
 
 def test_an_uncertain_position_is_a_finding():

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from twin.core import geometry
 from twin.core.links import Link, Links
-from twin.core.quality import EpipolarError, EstimationQuality, Finding
+from twin.core.quality import EpipolarError, EstimationQuality, Finding, LengthScale
 from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Trajectory
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
@@ -19,7 +20,12 @@ from twin.session.assembly import make_navigator
 from twin.session.conclusion import status
 from twin.session.flown_survey import plugin_notes
 from twin.session.monitor import SurveyMonitor
-from twin.session.survey_check import calibration_notes, off_course_limit_m, survey_findings
+from twin.session.survey_check import (
+    calibration_notes,
+    off_course_limit_m,
+    survey_findings,
+    with_altimeter_scale,
+)
 from twin.world.mission import prepare
 
 
@@ -87,6 +93,41 @@ def test_only_a_lasting_departure_from_the_path_is_a_finding():
         path[30 : 30 + n_frames, 1] = 1.1 * limit_m
         assert checks(result_at(path), elevation(1.0), np.zeros((90, 3))) == expected
     assert off_course_limit_m(mission("control.off_course_m=0.02")) == 0.02
+
+
+@pytest.mark.parametrize("gradient", [0.0, 0.3])
+def test_the_altimeter_gives_the_scale_of_depths(gradient):
+    """Oracle: a plane of gradient g at the distance h below is h / (cos a + g sin a) away within half a beam a."""
+    flown, half = mission("navigation.altimeter_beam_deg=8"), np.deg2rad(4)
+    x, y = np.meshgrid(*flown.grid.centres())
+    height_m = (gradient * x).astype(np.float32)
+    heights = ElevationMap(flown.grid, height_m, np.ones_like(height_m), np.zeros((*height_m.shape, 3), np.uint8))
+    positions = np.array([[-0.5, 0.0, 2.0], [0.0, 0.1, 2.2], [0.4, 0.0, 2.1]])
+    poses = np.array([geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, p) for p in positions])
+    path, angle = Trajectory(np.arange(3.0), poses), min(half, np.arctan(gradient))
+    true_m = (positions[:, 2] - gradient * positions[:, 0]) / (np.cos(angle) + gradient * np.sin(angle))
+    true_m *= 1 + 0.003 * np.array([1.0, -1.0, 0.0])
+
+    def found(scale, known=None):
+        quality = EstimationQuality(altimeter_m=dict(enumerate(true_m / scale)), depth_scale=known)
+        result = replace(result_at(positions), final=path, quality=quality)
+        return with_altimeter_scale(flown, result, heights).quality.depth_scale
+
+    for scale in (1.03, 0.97):
+        by_altimeter = found(scale)
+        assert by_altimeter.estimate == pytest.approx(scale, abs=1e-3) and by_altimeter.sensors == "the altimeter"
+        assert by_altimeter.sigma == pytest.approx(0.003 / 3**0.5 * scale, rel=0.02)
+    assert found(1.03, LengthScale(1.0, 1e-3, "pressure")).sensors == "pressure"
+    assert found(1.03, LengthScale(1.0, 0.01, "pressure")).sensors == "the altimeter"
+
+
+def test_without_readings_or_a_map_the_altimeter_gives_no_scale():
+    read, path = EstimationQuality(altimeter_m={0: 2.0, 1: 2.0}), np.zeros((2, 3))
+    result = replace(result_at(path), quality=read)
+    assert with_altimeter_scale(mission(), result, None) is result
+    assert with_altimeter_scale(mission(), result, elevation(0.0)) is result
+    unread = result_at(path)
+    assert with_altimeter_scale(mission(), unread, elevation(1.0)) is unread
 
 
 def test_removed_rectification_errors_are_reported():

@@ -12,6 +12,7 @@ from twin.kernels import kernel
 #: Columns of the grid of rays. A cell that the edge of the second image cuts is weighted by its fraction inside; the
 #: error of an overlap is therefore far smaller than the share of one cell.
 RAY_COLUMNS = 24
+_BEAM_RINGS, _BEAM_RAYS = 2, 8  # rays of the altimeter's beam: one on its axis, and rings around it
 #: A floor point is occluded if its ray meets the floor earlier by more than this fraction of its range.
 HIDDEN_BEFORE = 1e-3
 
@@ -71,6 +72,20 @@ def cast_camera_ray(field, pose, a, b):
     dy = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2]
     dz = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
     return cast_ray(field, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz)
+
+
+def beam_rays(beam_deg: float) -> Array:
+    """Returns normalised points (n, 2) in the beam of a width [deg] around the optical axis."""
+    rings = np.tan(np.deg2rad(beam_deg / 2)) * np.arange(1, _BEAM_RINGS + 1) / _BEAM_RINGS
+    angles = np.arange(_BEAM_RAYS) * (2 * np.pi / _BEAM_RAYS)
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([np.zeros((1, 2)), *(radius * ring for radius in rings)])
+
+
+def nearest_echo_m(field: HeightField, world_from_camera: Array, rays: Array) -> float:
+    """Returns the distance to the nearest point at which the floor is met by rays (n, 2) of a beam [m]; inf: none."""
+    depths = [cast_camera_ray(field, world_from_camera, a, b) for a, b in rays.tolist()]
+    return float(np.min(np.array(depths) * np.sqrt(1 + (rays**2).sum(axis=1))))
 
 
 @kernel

@@ -100,6 +100,9 @@ class EstimationQuality(NamedTuple):
     #: that were believed because motions had been predicted since the sensor last agreed; the others were not used.
     readings_disputed: Mapping[str, int] = MappingProxyType({})
     readings_believed: Mapping[str, int] = MappingProxyType({})
+    altimeter_m: Mapping[int, float] = MappingProxyType({})  #: readings of the altimeter at keyframes, by frame [m]
+    #: RMS of the residuals that successive readings of a sensor share / standard deviation of a reading, by sensor.
+    lasting_residuals: Mapping[str, float] = MappingProxyType({})
     reading_notes: Sequence[str] = ()  #: sentences on sensors that were frozen, or gave no readings for long
 
     @property

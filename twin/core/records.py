@@ -386,6 +386,8 @@ class ElevationMap:
     mosaic: Image  #: (rows, cols, 3) uint8 RGB orthomosaic, black where unknown
     #: (4, 4) pose of the world in the map frame; the identity for a rig that looks down.
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
+    #: RMS of the differences of heights from two disjoint sets of keyframes / their standard deviation; None: unknown.
+    scatter: float | None = None
 
     def to_world(self, points: Array) -> Array:
         return geometry.transform(geometry.inverse(self.map_from_world), points)

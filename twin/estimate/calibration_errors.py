@@ -26,6 +26,7 @@ from twin.core.quality import (
 )
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.link_selection import RECURRENCE
+from twin.estimate.navigation.aiding import unary_factors
 from twin.estimate.navigation.dvl import body_displacement
 from twin.estimate.vision.stereo import Keyframe
 
@@ -97,6 +98,25 @@ def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> floa
         shift = geometry.transform(geometry.inverse(pose), world_from_camera[:, :3, 3])[:, :2] / depth * images_per_unit
         views.append(np.sum(np.prod(np.clip(1 - np.abs(shift), 0.0, None), axis=1)))
     return float(np.mean(views)) if views else 1.0
+
+
+def lasting_residuals(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> dict[str, float]:
+    """Returns the RMS, relative to their noise, of the residuals that the readings of a sensor share, by its name.
+
+    The mean product of whitened residuals at successive nodes is 0 for white noise, with the standard deviation v /
+    sqrt(number of products) for its variance v, half the mean squared difference (von Neumann 1941), at least 1. Where
+    the path is bent or turned, or the sensor is biased, it is the variance of that error. Sensors for which it is not
+    significant are left out.
+    """
+    poses, found = np.array([node.world_from_camera for node in nodes]).reshape(-1, 4, 4), dict[str, float]()
+    for name, factors in zip(("pressure", "AHRS", "USBL"), unary_factors(nodes, rig, noise)[:3], strict=True):
+        if len(factors.pose_index) > 1:
+            whitened = factors.residuals(poses[factors.pose_index]) @ np.linalg.cholesky(factors.information[0])
+            products = whitened[1:] * whitened[:-1]
+            variance = max(float((np.diff(whitened, axis=0) ** 2).mean()) / 2, 1.0)
+            if products.mean() > SIGNIFICANT * variance / np.sqrt(products.size):
+                found[name] = float(np.sqrt(products.mean()))
+    return found
 
 
 class _Fit(NamedTuple):

@@ -38,9 +38,10 @@ from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.blind_frames import BlindFrame, aligned, blind_frame
-from twin.estimate.calibration_errors import length_scales
+from twin.estimate.calibration_errors import lasting_residuals, length_scales
 from twin.estimate.late_readings import ReadingsBetweenNodes, motion_since
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
+from twin.estimate.mapping.height_check import flown_back, with_scatter
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
 from twin.estimate.navigation.pose_filter import DeadReckoningState, PoseFilter, clip_covariance
@@ -426,6 +427,8 @@ class Navigator:
             distortion=self.network.distortion(),
             calibration=history.calibration,
             independent_errors=history.independent_errors,
+            altimeter_m={n.row: n.readings.altitude_m for n in nodes if n.readings.altitude_m is not None},
+            lasting_residuals=lasting_residuals(nodes, self.rig, self.network.noise),
             length_scale=across,
             depth_scale=along,
             readings_rejected=dict(zip(SENSORS, counts[:, 1].tolist(), strict=True)),
@@ -460,6 +463,22 @@ class Navigator:
         steps = steps_between(result.step_cov, linked)
         found = self.vision.build_map(turned, grid, steps, lambda n_done: report(n_done / len(linked)))
         return replace(found, map_from_world=map_from_world)
+
+    def with_tested_sigma(
+        self, result: SurveyResult, elevation: ElevationMap, chosen: NDArray[np.bool_] | None = None
+    ) -> ElevationMap:
+        """Returns the map of `build_map`, tested with the maps of the legs there and back (`with_scatter`).
+
+        Unchanged without images. Raises OSError if an image could not be read.
+        """
+        turned, linked, _ = _linked_in_map(result, chosen)
+        if len(linked) < 2 or self.vision.left_image(int(turned.keyframe_rows[0])) is None:
+            return elevation
+        back = flown_back(turned.final.positions[turned.keyframe_rows])
+        sets = np.flatnonzero(back), np.flatnonzero(~back)
+        parts = [(_of_keyframes(turned, part), steps_between(result.step_cov, linked[part])) for part in sets]
+        maps = [self.vision.build_map(part, elevation.grid, steps, _ignore) for part, steps in parts]
+        return with_scatter(elevation, *maps)
 
     def build_tiles(
         self, result: SurveyResult, progress: Callable[[float], None] | None = None

@@ -23,9 +23,11 @@ MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correcti
 MAX_ROW_PATTERN_PX = 0.1  # systematic row difference that pitch, yaw, roll and a row offset do not explain, RMS
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_DISPARITY_OFFSET_PX = 0.08  # offset of all disparities, estimated from the motions between keyframes
-MAX_DISTORTION_PX = 0.6  # disparity error by a radial distortion, and by the yaw that is estimated in its place
+MAX_DISTORTION_PX = 0.3  # disparity error by a radial distortion, and by the yaw that is estimated in its place
+MAX_LASTING = 1.0  # RMS of the residuals that successive readings of a sensor share / standard deviation of a reading
 MAX_SCALE_ERROR = 0.01  # relative difference of lengths from the images and from navigation sensors
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
+MAX_SCATTER = 2.0  # RMS difference of heights from two sets of keyframes / its standard deviation
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
 ROW_PATTERN = "row_pattern"  #: name of the check of systematic row differences
 _COVERED = 3.0  # largest effect of a calibration error that the standard deviation of a result covers [its sigmas]
@@ -35,7 +37,9 @@ def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
     """Returns the failed checks: tracking, navigation sensors, stereo, rectification and consistency, in this order."""
     damage = _Damage(result, rig, elevation)
     checks = _tracking(result), _stereo(result), _rectification(result, damage), _consistency(result, damage)
-    return [finding for findings in checks for finding in findings]
+    scatter = None if elevation is None else elevation.scatter
+    text = f"heights from legs there and back differ by {scatter or 0:.1f} times their standard deviation"
+    return [finding for findings in checks for finding in findings] + _above("scatter", scatter, MAX_SCATTER, text)
 
 
 def with_length_error(
@@ -128,6 +132,12 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
         end = f"{believed} were believed in the end" if believed else f"{count} more were not used"
         text = f"{sensor} readings contradicted the estimates for long, and {end}"
         yield from _above(f"readings_{sensor}", count, 0, text)
+    for sensor, ratio in quality.lasting_residuals.items():
+        text = (
+            f"the path differs from the {sensor} readings by {ratio:.1f} times their standard deviation for long: it is"
+            " bent or turned, or the sensor has an error"
+        )
+        yield from _above(f"lasting_{sensor}", ratio, MAX_LASTING, text)
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:

@@ -42,7 +42,7 @@ class PluginNavigator:
         self._navigator = Navigator(setup.rig, settings, setup.start, setup.noise, vision, stopwatch=vision.stopwatch)
         self.network, self.close = self._navigator.network, self._navigator.close
         self.build_map, self.build_tiles = self._navigator.build_map, self._navigator.build_tiles
-        self.orthomosaic = self._navigator.orthomosaic
+        self.orthomosaic, self.with_tested_sigma = self._navigator.orthomosaic, self._navigator.with_tested_sigma
         self._images = vision
         self._pose, self._cov = setup.start.copy(), np.zeros((6, 6))
         self._node_covs: list[Array] = []

@@ -43,7 +43,11 @@ class Estimation(NamedTuple):
         """
         report = partial(self.progress, "map")
         try:
-            return self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))
+            found = self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))
+            if found is None:
+                return None
+            test = partial(self.navigator.with_tested_sigma, result, found, chosen)
+            return self.guard.attempt("height check", test) or found
         except OSError as error:
             self.guard.cause = self.guard.cause or str(error)
             return None

@@ -18,7 +18,7 @@ from twin.report.run_writer import PlannedTruth, SurveyRecord
 from twin.scenario.idealisations import idealisations
 from twin.scenario.model import Scenario
 from twin.session.conclusion import Estimation, Maps
-from twin.session.survey_check import calibration_notes, survey_findings
+from twin.session.survey_check import calibration_notes, survey_findings, with_altimeter_scale
 from twin.world.energy import flown_energy
 from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Detail, Mission
@@ -69,10 +69,12 @@ class FlownSurvey:
         return guard.attempt("orthomosaic", without_file_errors) or Maps(elevation)
 
     def findings(self, result: SurveyResult, elevation: ElevationMap | None) -> list[Finding]:
+        result = with_altimeter_scale(self.mission, result, elevation)
         return survey_findings(self.mission, result, elevation, self.truth.reference)
 
     def evaluation(self, result: SurveyResult, maps: Maps) -> EvaluationInput:
         mission, scenario, actions = self.mission, self.mission.scenario, self.actions
+        result = with_altimeter_scale(mission, result, maps.elevation)
         along, across = planned_overlap(mission)
         plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
         plan |= {"both_ways": mission.plan.follows_floor} | mission.plan.swath_notes

@@ -3,10 +3,9 @@
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.height_field import HeightField, cast_camera_ray, cast_ray
+from twin.core.height_field import HeightField, beam_rays, cast_ray, nearest_echo_m
 from twin.scenario.model import NavigationConfig
 
-_BEAM_RINGS, _BEAM_RAYS = 2, 8  # rays of the altimeter's beam: one on its axis, and rings around it
 _LEAST_BEAMS = 3  # of the DVL, which determine a velocity
 
 
@@ -15,16 +14,12 @@ class Altimeter:
 
     def __init__(self, settings: NavigationConfig, floor: HeightField, rng: np.random.Generator):
         self._settings, self.floor, self._rng = settings, floor, rng
-        rings = np.tan(np.deg2rad(settings.altimeter_beam_deg / 2)) * np.arange(1, _BEAM_RINGS + 1) / _BEAM_RINGS
-        angles = np.arange(_BEAM_RAYS) * (2 * np.pi / _BEAM_RAYS)
-        ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        self._rays = np.concatenate([np.zeros((1, 2)), *(radius * ring for radius in rings)])
+        self._rays = beam_rays(settings.altimeter_beam_deg)
 
     def read(self, world_from_camera: Array) -> float | None:
         """Returns the distance to the floor [m]; None outside the range of the sensor."""
         number = float(self._rng.standard_normal())
-        depths = [cast_camera_ray(self.floor, world_from_camera, a, b) for a, b in self._rays.tolist()]
-        distance_m = float(np.min(np.array(depths) * np.sqrt(1 + (self._rays**2).sum(axis=1))))
+        distance_m = nearest_echo_m(self.floor, world_from_camera, self._rays)
         nearest_m, farthest_m = self._settings.altimeter_range_m
         if not nearest_m <= distance_m <= farthest_m:
             return None
