@@ -541,9 +541,7 @@ def products(
 def change(
     first: Annotated[Path, argument("Folder of the earlier run.", "RUN1")],
     second: Annotated[Path, argument("Folder of the later run.", "RUN2")],
-    scale_m: Annotated[
-        float, option("Size of the changes that are looked for.", "M", "--scale", min=0.001, max=1000)
-    ] = 0.2,
+    scale_m: Annotated[float, option("Size of changes to look for.", "M", "--scale", min=0.001, max=1000)] = 0.2,
     out: Annotated[Path, option("Folder to write.")] = Path("runs/change"),
     as_json: SummaryJson = False,
 ) -> None:

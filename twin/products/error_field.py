@@ -29,9 +29,6 @@ class SigmaParts(NamedTuple):
     def total(self) -> float:
         return float(np.linalg.norm(self))
 
-    def scaled(self, factor: float) -> "SigmaParts":
-        return SigmaParts(self.random * factor, self.correlated * factor, self.systematic * factor)
-
 
 class ErrorField(NamedTuple):
     """Covariance C_ij = s_i s_j r(h / window) + l_i l_j r(h / range) of the errors of two cells at the distance h.
@@ -52,10 +49,10 @@ class ErrorField(NamedTuple):
 
     def samples(self, n: int, seed: int) -> Iterator[Layer]:
         """Yields n random fields of errors (rows, cols) [m]."""
-        rng, shape = np.random.default_rng(seed), self.sigma_m.shape
+        rng, cell_m = np.random.default_rng(seed), self.cell_m
         for _ in range(n):
-            random = self.sigma_m * _unit_field(shape, self.window_m / self.cell_m, rng)
-            yield random + self.long_sigma_m * _unit_field(shape, self.long_range_m / self.cell_m, rng)
+            random = self.sigma_m * _unit_field(self.sigma_m.shape, self.window_m / cell_m, rng)
+            yield random + self.long_sigma_m * _unit_field(self.sigma_m.shape, self.long_range_m / cell_m, rng)
 
 
 def fitted(difference_m: Layer, sigma_m: Layer, cell_m: float, stable: Layer) -> ErrorField:
@@ -99,10 +96,7 @@ def _best_range(curve: Layer, ranges: Layer, plateau: bool) -> tuple[float, floa
 
 
 def _autocovariance(values: Layer, weights: Layer) -> Layer:
-    """Returns lags [cells] up to half the extent, isotropic mean products and sums of weights (3, n).
-
-    `values` (rows, cols) are multiplied by their weights.
-    """
+    """Returns lags [cells], mean products and sums of weights (3, n); `values` are multiplied by their weights."""
     reach = max(values.shape) // 2 + 1
     shape = _padded(values.shape, reach)
     products, sums = (fft.irfft2(np.abs(fft.rfft2(part, shape)) ** 2, shape) for part in (values, weights))

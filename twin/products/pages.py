@@ -104,29 +104,34 @@ def change_of(first_folder: Path, second_folder: Path, scale_m: float) -> Result
     Raises TwinError if a run has no map with standard deviations, or their maps cannot be compared.
     """
     first, second = load_run(first_folder), load_run(second_folder)
-    heights = _heights(first, "RUN1")
-    change = change_between(heights, _comparable(second, first, heights.grid.cell_m), scale_m)
+    heights, others = _heights(first, "RUN1"), _heights(second, "RUN2")
+    cell_m, other_m = heights.grid.cell_m, others.grid.cell_m
+    if not np.isclose(other_m, cell_m, rtol=1e-6):
+        raise TwinError("RUN2", f"its map has cells of {other_m:g} m", f"those of RUN1, {cell_m:g} m")
+    if second.georeference != first.georeference:
+        raise TwinError("RUN2", "its scene has another CRS or origin than that of RUN1", "two surveys of one scene")
+    change = change_between(heights, others, scale_m)
     titles = {
         "difference": (change.registration.difference_m, "change of height"),
         "detection_level": (change.detection_level_m, "level of detection of a cell (95 %)"),
         "detectable": (change.detectable_m, f"change of {scale_m:g} m x {scale_m:g} m found in 95 %"),
     }
     layers = {name: (Raster(heights.grid, values), title, "m") for name, (values, title) in titles.items()}
-    detectable_m = finite_tree(np.nanquantile(change.detectable_m, [0.5, 0.9]))
-    truth = None
+    known, truth, patches = np.isfinite(change.sigma_m), None, change.patches
+    net, detectable_m = change.patch(known), finite_tree(np.nanquantile(change.detectable_m, [0.5, 0.9]))
+    motion = zip(change.registration.values, np.sqrt(np.diag(change.registration.cov)), strict=True)
     tree = {
-        "patches": _tree(change.patches),
-        "net": _tree(change.net),
-        "significant_cells": float(change.significant[np.isfinite(change.sigma_m)].mean()),
+        "patches": _tree(patches),
+        "net": _tree(net),
+        "significant_cells": float(change.significant[known].mean()),
         "detectable_median_m": detectable_m[0],
-        "threshold": change.threshold,
-        "registration": dict(zip(PARAMETERS, finite_tree(change.registration.values), strict=True)),
-        "registration_sigma": finite_tree(np.sqrt(np.diag(change.registration.cov))),
+        "registration_and_sigma": dict(zip(PARAMETERS, finite_tree(motion), strict=True)),
     }
     before, after = (run.rasters.get("dem_truth") for run in (first, second))
     if before is not None and after is not None and before.grid == after.grid == heights.grid:
         truth = tree["truth"] = judged(change, after.values - before.values)
-    variables = {"change": change, "truth": truth, "second": second, "scale_m": scale_m, "detectable_m": detectable_m}
+    variables = {"change": change, "patches": patches, "net": net, "truth": truth, "second": second}
+    variables |= {"scale_m": scale_m, "detectable_m": detectable_m}
     return Results("change", first, tree, layers, variables, change.labels > 0)
 
 
@@ -156,15 +161,6 @@ def _heights(run: Run, name: str) -> Heights:
         if layer not in run.rasters:
             raise TwinError(name, f"{run.folder} has no {layer}.tif", "a run with a map")
     return Heights(run.rasters["dem"].grid, run.rasters["dem"].values, run.rasters["dem_sigma"].values)
-
-
-def _comparable(second: Run, first: Run, cell_m: float) -> Heights:
-    heights = _heights(second, "RUN2")
-    if not np.isclose(heights.grid.cell_m, cell_m, rtol=1e-6):
-        raise TwinError("RUN2", f"its map has cells of {heights.grid.cell_m:g} m", f"those of RUN1, {cell_m:g} m")
-    if second.georeference != first.georeference:
-        raise TwinError("RUN2", "its scene has another CRS or origin than that of RUN1", "two surveys of one scene")
-    return heights
 
 
 def _tree(value: Any) -> Any:
