@@ -96,6 +96,14 @@ def test_the_variance_of_a_sum_is_that_of_independent_or_of_equal_errors_at_the_
     assert equal.covariances(weights)[1][0, 0] == pytest.approx(1200**2 * 1e-4, rel=1e-3)
 
 
+def test_the_difference_of_two_cells_has_the_variance_of_the_spherical_model():
+    """At half the range, r = 1 - 3/4 + 1/16; the variance of a difference is 2 s^2 (1 - r)."""
+    weights = np.zeros((1, 20, 30))
+    weights[0, 5, 4], weights[0, 5, 9] = 1.0, -1.0
+    errors = ErrorField(CELL_M, np.full((20, 30), 0.01), 10 * CELL_M, np.zeros((20, 30)), 1.0)
+    assert errors.covariances(weights)[0][0, 0] == pytest.approx(2e-4 * (1 - 0.3125))
+
+
 def test_samples_have_the_covariance_of_the_field():
     """Over 300 samples a standard deviation is known to 4 %."""
     errors = error_field(shape=(60, 60))
@@ -265,7 +273,8 @@ def test_changes_are_found_with_the_stated_probability():
     assert abs(found - expected) < 3 * np.sqrt(variance) + 1
 
 
-def test_the_change_of_height_is_that_of_py4dgeo():
+def test_the_change_of_height_is_that_of_py4dgeo(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # it writes a log
     py4dgeo = pytest.importorskip("py4dgeo", reason="py4dgeo is not installed")
     x, y = coordinates()
     change_m = bump(0.5, 0.4, 0.03)
