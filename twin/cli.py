@@ -524,10 +524,7 @@ def compare(
 @app.command()
 def products(
     folder: RunFolder,
-    level_m: Annotated[
-        float | None,
-        option("Height of the level of the volume. Default: 1st percentile of the heights.", "M", "--level"),
-    ] = None,
+    level_m: Annotated[float | None, option("Height of the plane below the volume.", "M", "--level")] = None,
     out: Annotated[Path | None, option("Folder to write. Default: RUN/products.")] = None,
     as_json: SummaryJson = False,
 ) -> None:

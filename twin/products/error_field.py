@@ -108,20 +108,22 @@ def _autocovariance(values: Layer, weights: Layer) -> Layer:
 
 def _quadratic_forms(layers: Layer, reach: float) -> Layer:
     """Returns the sums (n, n) over all pairs of cells of w_i r(h_ij / reach) v_j, for layers (n, rows, cols)."""
-    shape = _padded(layers.shape[1:], reach)
-    spectra = fft.fft2(layers, shape).reshape(len(layers), -1)
-    return np.real((spectra * _spectrum(shape, reach).ravel() / spectra.shape[1]) @ spectra.conj().T)
+    _, rows, cols = layers.shape
+    shape = _padded((rows, cols), reach)
+    spectrum = _spectrum(shape, reach)
+    spread = [fft.irfft2(fft.rfft2(layer, shape) * spectrum, shape)[:rows, :cols] for layer in layers]
+    return np.einsum("irc,jrc->ij", layers, np.array(spread))
 
 
 def _unit_field(shape: tuple[int, ...], reach: float, rng: np.random.Generator) -> Layer:
     """Returns normal numbers (rows, cols) of unit variance with spherical correlation (circulant embedding)."""
     padded = _padded(shape, reach)
-    white = fft.fft2(rng.standard_normal(padded))
-    return fft.ifft2(white * np.sqrt(_spectrum(padded, reach))).real[: shape[0], : shape[1]]
+    white = fft.rfft2(rng.standard_normal(padded))
+    return fft.irfft2(white * np.sqrt(_spectrum(padded, reach)), padded)[: shape[0], : shape[1]]
 
 
 def _spectrum(shape: tuple[int, ...], reach: float) -> Layer:
-    return np.maximum(np.real(fft.fft2(_spherical(_distances(shape) / reach))), 0.0)
+    return np.maximum(np.real(fft.rfft2(_spherical(_distances(shape) / reach))), 0.0)
 
 
 def _spherical(distance: Layer) -> Layer:

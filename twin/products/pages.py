@@ -19,7 +19,7 @@ from twin.products.surface import Layer, block_means, slope_deg
 from twin.products.survey_products import error_field_of_map, survey_products
 from twin.report.html import render_page, render_text
 from twin.report.plotting import WIDTH_IN, drawn, extent_of, hillshade
-from twin.report.run_folder import Run, load_run
+from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.survey_figures import map_axes, scalar_map
 
 _CHANGED_M = 1e-3  # true change above which a cell counts as changed
@@ -74,9 +74,11 @@ class Results(NamedTuple):
 def products_of(folder: Path, level_m: float | None = None) -> Results:
     """Returns the products of a run; raises TwinError if it has no map with standard deviations, or a too small one."""
     run = load_run(folder)
-    heights, rig = _heights(run, "RUN"), run.scenario["rig"]
+    heights, rig = _heights(run, "RUN"), run.scenario.get("rig", {})
     if "final" not in run.trajectories:
         raise TwinError("RUN", f"{run.folder} has no trajectory_final.tum", "a finished run")
+    if missing := {"hfov_deg", "image_width_px", "baseline_m"} - rig.keys():
+        raise TwinError(f"RUN: {SCENARIO_FILE}: rig.{min(missing)}", "missing", "a file of `twin run` or `twin replay`")
     above_floor_m = np.median(run.trajectories["final"].positions[:, 2]) - np.nanmedian(heights.height_m)
     width_m = float(2 * above_floor_m * np.tan(np.deg2rad(rig["hfov_deg"]) / 2))
     errors = error_field_of_map(heights, width_m / rig["image_width_px"], width_m)
