@@ -96,14 +96,22 @@ def test_the_variance_of_a_sum_is_that_of_independent_or_of_equal_errors_at_the_
     assert equal.covariances(weights)[1][0, 0] == pytest.approx(1200**2 * 1e-4, rel=1e-3)
 
 
+def test_the_difference_of_two_cells_has_the_variance_of_the_spherical_model():
+    """At half the range, r = 1 - 3/4 + 1/16; the variance of a difference is 2 s^2 (1 - r)."""
+    weights = np.zeros((1, 20, 30))
+    weights[0, 5, 4], weights[0, 5, 9] = 1.0, -1.0
+    errors = ErrorField(CELL_M, np.full((20, 30), 0.01), 10 * CELL_M, np.zeros((20, 30)), 1.0)
+    assert errors.covariances(weights)[0][0, 0] == pytest.approx(2e-4 * (1 - 0.3125))
+
+
 def test_samples_have_the_covariance_of_the_field():
-    """Over 300 samples a standard deviation is known to 4 %."""
+    """Over 160 samples a standard deviation is known to 5.6 %."""
     errors = error_field(shape=(60, 60))
     weights = np.zeros((60, 60))
     weights[10:30, 15:40] = 1.0
-    sums = [float((field * weights).sum()) for field in errors.samples(300, seed=3)]
+    sums = [float((field * weights).sum()) for field in errors.samples(160, seed=3)]
     expected = np.sqrt(sum(part[0, 0] for part in errors.covariances(weights[None])))
-    assert np.std(sums) == pytest.approx(expected, rel=0.13)
+    assert np.std(sums) == pytest.approx(expected, rel=0.17)
 
 
 def test_the_fit_finds_the_error_field():
@@ -139,14 +147,14 @@ def test_the_registration_undoes_a_motion():
 
 
 def test_the_errors_of_the_registration_are_those_of_its_covariance():
-    """The mean of error^2 / variance is 1 for each parameter; over 30 pairs and 7 parameters it is known to 10 %."""
+    """The mean of error^2 / variance is 1 for each parameter; over 14 pairs and 7 parameters it is known to 14 %."""
     errors, true_m = error_field(long_m=0.0), floor(*coordinates())
     zero = Heights(grid(), true_m, np.full(SHAPE, 0.001))
     stable, ratios = np.ones(SHAPE, bool), []
-    for seed in range(30):
+    for seed in range(14):
         found = register(zero, heights_with(errors, seed, true_m), stable, errors)
         ratios.append(found.values**2 / np.diag(found.cov))
-    assert np.mean(ratios) == pytest.approx(1.0, abs=0.35)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.45)
 
 
 def test_the_shift_is_that_of_xdem():
@@ -265,7 +273,8 @@ def test_changes_are_found_with_the_stated_probability():
     assert abs(found - expected) < 3 * np.sqrt(variance) + 1
 
 
-def test_the_change_of_height_is_that_of_py4dgeo():
+def test_the_change_of_height_is_that_of_py4dgeo(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # it writes a log
     py4dgeo = pytest.importorskip("py4dgeo", reason="py4dgeo is not installed")
     x, y = coordinates()
     change_m = bump(0.5, 0.4, 0.03)
@@ -336,6 +345,21 @@ def test_twin_products_says_rugosity_with_grain_and_plane(monkeypatch, capsys, t
     page = (tmp_path / "p" / "products.html").read_text()
     assert "over the fitted plane" in page and "grain" in page
     assert (tmp_path / "p" / "slope.tif").is_file()
+
+
+def test_a_run_without_map_trajectory_or_rig_has_no_products(runs):
+    for name, message in (
+        ("trajectory_final.tum", "RUN: .* has no trajectory_final.tum"),
+        ("dem_sigma.tif", "RUN: .* has no dem_sigma.tif .allowed: a run with a map"),
+    ):
+        content = (runs[0] / name).read_bytes()
+        (runs[0] / name).unlink()
+        with pytest.raises(TwinError, match=message):
+            pages.products_of(runs[0])
+        (runs[0] / name).write_bytes(content)
+    (runs[0] / "scenario.resolved.toml").write_text('name = "test"\n')
+    with pytest.raises(TwinError, match="RUN: scenario.resolved.toml: rig.baseline_m: missing"):
+        pages.products_of(runs[0])
 
 
 def test_maps_that_cannot_be_compared_are_refused(tmp_path, runs):

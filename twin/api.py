@@ -184,21 +184,14 @@ def compare(*runs: str | Path | RunResult) -> dict[str, Any]:
 
 
 def map_products(run: str | Path | RunResult, level_m: float | None = None) -> dict[str, Any]:
-    """Returns rugosity, slope, area and volume of a run's map with standard deviations, as `twin products --json` does.
-
-    The volume stands on the level `level_m` [m], by default the 1st percentile of the heights. Raises TwinError if the
-    run has no map with standard deviations, or one that is too small.
-    """
+    """Returns what `twin products --json` prints; `level_m` is that of the volume, by default low; raises TwinError."""
     from twin.products.pages import products_of
 
     return products_of(_folder(run), level_m).tree
 
 
 def map_change(first: str | Path | RunResult, second: str | Path | RunResult, scale_m: float = 0.2) -> dict[str, Any]:
-    """Returns the change from one run to a later one, as `twin change --json` does.
-
-    `scale_m` is the size of the changes that are looked for [m]. Raises TwinError if the maps cannot be compared.
-    """
+    """Returns what `twin change --json` prints, for changes of the size `scale_m`; raises TwinError."""
     from twin.products.pages import change_of
 
     return change_of(_folder(first), _folder(second), scale_m).tree

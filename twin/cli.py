@@ -525,10 +525,7 @@ def compare(
 @app.command()
 def products(
     folder: RunFolder,
-    level_m: Annotated[
-        float | None,
-        option("Height of the level of the volume. Default: 1st percentile of the heights.", "M", "--level"),
-    ] = None,
+    level_m: Annotated[float | None, option("Height of the plane below the volume.", "M", "--level")] = None,
     out: Annotated[Path | None, option("Folder to write. Default: RUN/products.")] = None,
     as_json: SummaryJson = False,
 ) -> None:
@@ -542,9 +539,7 @@ def products(
 def change(
     first: Annotated[Path, argument("Folder of the earlier run.", "RUN1")],
     second: Annotated[Path, argument("Folder of the later run.", "RUN2")],
-    scale_m: Annotated[
-        float, option("Size of the changes that are looked for.", "M", "--scale", min=0.001, max=1000)
-    ] = 0.2,
+    scale_m: Annotated[float, option("Size of changes to look for.", "M", "--scale", min=0.001, max=1000)] = 0.2,
     out: Annotated[Path, option("Folder to write.")] = Path("runs/change"),
     as_json: SummaryJson = False,
 ) -> None:

@@ -33,15 +33,9 @@ class Patch(NamedTuple):
     y_m: float
     area_m2: float
     change_m: float  #: mean change of height
-    change_sigma: SigmaParts
+    interval_m: tuple[float, float]  #: its 95 % interval
     volume_m3: float
     volume_sigma: SigmaParts
-
-    @property
-    def interval_m(self) -> tuple[float, float]:
-        """Returns the 95 % interval of the mean change [m]."""
-        half_m = NORMAL_95 * self.change_sigma.total
-        return self.change_m - half_m, self.change_m + half_m
 
 
 class Change(NamedTuple):
@@ -61,11 +55,6 @@ class Change(NamedTuple):
     def patches(self) -> list[Patch]:
         return [self.patch(self.labels == number) for number in range(1, self.labels.max() + 1)]
 
-    @property
-    def net(self) -> Patch:
-        """Returns all cells that both maps have, as a patch."""
-        return self.patch(np.isfinite(self.sigma_m))
-
     def patch(self, inside: Mask) -> Patch:
         """Returns mean change and volume of a mask of cells, which both maps have."""
         weights, of_maps = inside * self.grid.cell_m**2, self.registration
@@ -75,7 +64,8 @@ class Change(NamedTuple):
         sigma = SigmaParts(*(float(part) for part in parts))
         volume_m3, area_m2 = float(np.nansum(of_maps.difference_m * weights)), float(weights.sum())
         x, y = (float(values[inside].mean()) for values in np.meshgrid(*self.grid.centres()))
-        return Patch(x, y, area_m2, volume_m3 / area_m2, sigma.scaled(1 / area_m2), volume_m3, sigma)
+        mean_m, half_m = volume_m3 / area_m2, NORMAL_95 * sigma.total / area_m2
+        return Patch(x, y, area_m2, mean_m, (mean_m - half_m, mean_m + half_m), volume_m3, sigma)
 
     @property
     def significant(self) -> Mask:
@@ -130,8 +120,7 @@ def _look(maps: tuple[Heights, Heights], stable: Mask, counted: Mask, side: int,
 def _smoothed(of_maps: MapRegistration, errors: ErrorField, sigma_m: Layer, side: int) -> tuple[Layer, Layer]:
     """Returns the weighted mean of the difference over squares and its standard deviation (rows, cols) [m].
 
-    With weights 1 / s^2 of n equally correlated cells, the variance of the mean of random errors is k / sum of weights,
-    where k is the mean over the cells of a square of the sum of their correlations.
+    With weights 1 / s^2, the variance of random errors is (mean sum of correlations of a cell) / (sum of weights).
     """
     weights = _weights(errors.sigma_m)
     enough = (_mean((weights > 0).astype(float), side) >= 0.5) & (weights > 0)
@@ -146,22 +135,19 @@ def _smoothed(of_maps: MapRegistration, errors: ErrorField, sigma_m: Layer, side
 
 
 def _threshold(ratio: Layer, counted: Mask, side: int, clean_share: float) -> float:
-    """Returns the |mean / sigma| that errors exceed anywhere in a map in 5 % of the surveys.
+    """Returns the |mean / sigma| that errors exceed anywhere in 5 % of the surveys, at least that of normal errors.
 
-    The tail of the maxima is taken as exponential (generalised Pareto distribution of shape 0) from their 80th
-    percentile on, with the scale of the quantile `clean_share` of the maxima above; the others may be changes. At least
-    the threshold of as many independent normal numbers as there are squares.
+    The tail of the maxima is exponential (generalised Pareto distribution of shape 0) from their 80th percentile on,
+    with the scale of the quantile `clean_share` of the maxima above; the others may be changes.
     """
     size = np.abs(ratio)
     n_squares = max(int((size > 0).sum() / side**2), 1)
     normal = -float(ndtri((1 - CONFIDENCE) / 2 / n_squares))
     peaks = size[(size == maximum_filter(size, side)) & (size > 0) & counted]
-    excess = peaks - np.quantile(peaks, _UPPER_PEAKS) if len(peaks) else peaks
-    excess = excess[excess > 0]
-    if not len(excess):
-        return normal
-    tail = np.quantile(excess, clean_share) / -np.log(1 - clean_share)
-    return max(normal, float(np.quantile(peaks, _UPPER_PEAKS) + tail * np.log(len(excess) / (1 - CONFIDENCE))))
+    start = np.quantile(peaks, _UPPER_PEAKS) if len(peaks) else 0.0
+    excess = peaks[peaks > start] - start
+    tail = np.quantile(excess, clean_share) / -np.log(1 - clean_share) if len(excess) else 0.0
+    return max(normal, float(start + tail * np.log(max(len(excess), 1) / (1 - CONFIDENCE))))
 
 
 def _labels(ratio: Layer, threshold: float) -> Layer:

@@ -29,9 +29,6 @@ class SigmaParts(NamedTuple):
     def total(self) -> float:
         return float(np.linalg.norm(self))
 
-    def scaled(self, factor: float) -> "SigmaParts":
-        return SigmaParts(self.random * factor, self.correlated * factor, self.systematic * factor)
-
 
 class ErrorField(NamedTuple):
     """Covariance C_ij = s_i s_j r(h / window) + l_i l_j r(h / range) of the errors of two cells at the distance h.
@@ -52,10 +49,10 @@ class ErrorField(NamedTuple):
 
     def samples(self, n: int, seed: int) -> Iterator[Layer]:
         """Yields n random fields of errors (rows, cols) [m]."""
-        rng, shape = np.random.default_rng(seed), self.sigma_m.shape
+        rng, cell_m = np.random.default_rng(seed), self.cell_m
         for _ in range(n):
-            random = self.sigma_m * _unit_field(shape, self.window_m / self.cell_m, rng)
-            yield random + self.long_sigma_m * _unit_field(shape, self.long_range_m / self.cell_m, rng)
+            random = self.sigma_m * _unit_field(self.sigma_m.shape, self.window_m / cell_m, rng)
+            yield random + self.long_sigma_m * _unit_field(self.sigma_m.shape, self.long_range_m / cell_m, rng)
 
 
 def fitted(difference_m: Layer, sigma_m: Layer, cell_m: float, stable: Layer) -> ErrorField:
@@ -99,10 +96,7 @@ def _best_range(curve: Layer, ranges: Layer, plateau: bool) -> tuple[float, floa
 
 
 def _autocovariance(values: Layer, weights: Layer) -> Layer:
-    """Returns lags [cells] up to half the extent, isotropic mean products and sums of weights (3, n).
-
-    `values` (rows, cols) are multiplied by their weights.
-    """
+    """Returns lags [cells], mean products and sums of weights (3, n); `values` are multiplied by their weights."""
     reach = max(values.shape) // 2 + 1
     shape = _padded(values.shape, reach)
     products, sums = (fft.irfft2(np.abs(fft.rfft2(part, shape)) ** 2, shape) for part in (values, weights))
@@ -114,20 +108,22 @@ def _autocovariance(values: Layer, weights: Layer) -> Layer:
 
 def _quadratic_forms(layers: Layer, reach: float) -> Layer:
     """Returns the sums (n, n) over all pairs of cells of w_i r(h_ij / reach) v_j, for layers (n, rows, cols)."""
-    shape = _padded(layers.shape[1:], reach)
-    spectra = fft.fft2(layers, shape).reshape(len(layers), -1)
-    return np.real((spectra * _spectrum(shape, reach).ravel() / spectra.shape[1]) @ spectra.conj().T)
+    _, rows, cols = layers.shape
+    shape = _padded((rows, cols), reach)
+    spectrum = _spectrum(shape, reach)
+    spread = [fft.irfft2(fft.rfft2(layer, shape) * spectrum, shape)[:rows, :cols] for layer in layers]
+    return np.einsum("irc,jrc->ij", layers, np.array(spread))
 
 
 def _unit_field(shape: tuple[int, ...], reach: float, rng: np.random.Generator) -> Layer:
     """Returns normal numbers (rows, cols) of unit variance with spherical correlation (circulant embedding)."""
     padded = _padded(shape, reach)
-    white = fft.fft2(rng.standard_normal(padded))
-    return fft.ifft2(white * np.sqrt(_spectrum(padded, reach))).real[: shape[0], : shape[1]]
+    white = fft.rfft2(rng.standard_normal(padded))
+    return fft.irfft2(white * np.sqrt(_spectrum(padded, reach)), padded)[: shape[0], : shape[1]]
 
 
 def _spectrum(shape: tuple[int, ...], reach: float) -> Layer:
-    return np.maximum(np.real(fft.fft2(_spherical(_distances(shape) / reach))), 0.0)
+    return np.maximum(np.real(fft.rfft2(_spherical(_distances(shape) / reach))), 0.0)
 
 
 def _spherical(distance: Layer) -> Layer:

@@ -19,7 +19,7 @@ from twin.products.surface import Layer, block_means, slope_deg
 from twin.products.survey_products import error_field_of_map, survey_products
 from twin.report.html import render_page, render_text
 from twin.report.plotting import WIDTH_IN, drawn, extent_of, hillshade
-from twin.report.run_folder import Run, load_run
+from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.survey_figures import map_axes, scalar_map
 
 _CHANGED_M = 1e-3  # true change above which a cell counts as changed
@@ -74,9 +74,11 @@ class Results(NamedTuple):
 def products_of(folder: Path, level_m: float | None = None) -> Results:
     """Returns the products of a run; raises TwinError if it has no map with standard deviations, or a too small one."""
     run = load_run(folder)
-    heights, rig = _heights(run, "RUN"), run.scenario["rig"]
+    heights, rig = _heights(run, "RUN"), run.scenario.get("rig", {})
     if "final" not in run.trajectories:
         raise TwinError("RUN", f"{run.folder} has no trajectory_final.tum", "a finished run")
+    if missing := {"hfov_deg", "image_width_px", "baseline_m"} - rig.keys():
+        raise TwinError(f"RUN: {SCENARIO_FILE}: rig.{min(missing)}", "missing", "a file of `twin run` or `twin replay`")
     above_floor_m = np.median(run.trajectories["final"].positions[:, 2]) - np.nanmedian(heights.height_m)
     width_m = float(2 * above_floor_m * np.tan(np.deg2rad(rig["hfov_deg"]) / 2))
     errors = error_field_of_map(heights, width_m / rig["image_width_px"], width_m)
@@ -104,29 +106,34 @@ def change_of(first_folder: Path, second_folder: Path, scale_m: float) -> Result
     Raises TwinError if a run has no map with standard deviations, or their maps cannot be compared.
     """
     first, second = load_run(first_folder), load_run(second_folder)
-    heights = _heights(first, "RUN1")
-    change = change_between(heights, _comparable(second, first, heights.grid.cell_m), scale_m)
+    heights, others = _heights(first, "RUN1"), _heights(second, "RUN2")
+    cell_m, other_m = heights.grid.cell_m, others.grid.cell_m
+    if not np.isclose(other_m, cell_m, rtol=1e-6):
+        raise TwinError("RUN2", f"its map has cells of {other_m:g} m", f"those of RUN1, {cell_m:g} m")
+    if second.georeference != first.georeference:
+        raise TwinError("RUN2", "its scene has another CRS or origin than that of RUN1", "two surveys of one scene")
+    change = change_between(heights, others, scale_m)
     titles = {
         "difference": (change.registration.difference_m, "change of height"),
         "detection_level": (change.detection_level_m, "level of detection of a cell (95 %)"),
         "detectable": (change.detectable_m, f"change of {scale_m:g} m x {scale_m:g} m found in 95 %"),
     }
     layers = {name: (Raster(heights.grid, values), title, "m") for name, (values, title) in titles.items()}
-    detectable_m = finite_tree(np.nanquantile(change.detectable_m, [0.5, 0.9]))
-    truth = None
+    known, truth, patches = np.isfinite(change.sigma_m), None, change.patches
+    net, detectable_m = change.patch(known), finite_tree(np.nanquantile(change.detectable_m, [0.5, 0.9]))
+    motion = zip(change.registration.values, np.sqrt(np.diag(change.registration.cov)), strict=True)
     tree = {
-        "patches": _tree(change.patches),
-        "net": _tree(change.net),
-        "significant_cells": float(change.significant[np.isfinite(change.sigma_m)].mean()),
+        "patches": _tree(patches),
+        "net": _tree(net),
+        "significant_cells": float(change.significant[known].mean()),
         "detectable_median_m": detectable_m[0],
-        "threshold": change.threshold,
-        "registration": dict(zip(PARAMETERS, finite_tree(change.registration.values), strict=True)),
-        "registration_sigma": finite_tree(np.sqrt(np.diag(change.registration.cov))),
+        "registration_and_sigma": dict(zip(PARAMETERS, finite_tree(motion), strict=True)),
     }
     before, after = (run.rasters.get("dem_truth") for run in (first, second))
     if before is not None and after is not None and before.grid == after.grid == heights.grid:
         truth = tree["truth"] = judged(change, after.values - before.values)
-    variables = {"change": change, "truth": truth, "second": second, "scale_m": scale_m, "detectable_m": detectable_m}
+    variables = {"change": change, "patches": patches, "net": net, "truth": truth, "second": second}
+    variables |= {"scale_m": scale_m, "detectable_m": detectable_m}
     return Results("change", first, tree, layers, variables, change.labels > 0)
 
 
@@ -156,15 +163,6 @@ def _heights(run: Run, name: str) -> Heights:
         if layer not in run.rasters:
             raise TwinError(name, f"{run.folder} has no {layer}.tif", "a run with a map")
     return Heights(run.rasters["dem"].grid, run.rasters["dem"].values, run.rasters["dem_sigma"].values)
-
-
-def _comparable(second: Run, first: Run, cell_m: float) -> Heights:
-    heights = _heights(second, "RUN2")
-    if not np.isclose(heights.grid.cell_m, cell_m, rtol=1e-6):
-        raise TwinError("RUN2", f"its map has cells of {heights.grid.cell_m:g} m", f"those of RUN1, {cell_m:g} m")
-    if second.georeference != first.georeference:
-        raise TwinError("RUN2", "its scene has another CRS or origin than that of RUN1", "two surveys of one scene")
-    return heights
 
 
 def _tree(value: Any) -> Any:

@@ -29,6 +29,11 @@ class Measured(NamedTuple):
     value: float
     sigma: SigmaParts
 
+    def times(self, factor: float, scale_sigma: float = 0.0) -> "Measured":
+        """Returns it multiplied by a number with the relative standard deviation `scale_sigma`."""
+        value, (random, correlated, systematic) = self.value * factor, (part * factor for part in self.sigma)
+        return Measured(value, SigmaParts(random, correlated, float(np.hypot(systematic, scale_sigma * value))))
+
 
 class GrainProducts(NamedTuple):
     """Means over the map at one grain."""
@@ -48,7 +53,7 @@ class GrainProducts(NamedTuple):
 
 class SurveyProducts(NamedTuple):
     grains: tuple[GrainProducts, ...]  #: finest first
-    chosen: int  #: index of the finest grain that is reliable; the last if none is
+    chosen: int  #: index of the finest reliable grain; the last if none is
     tilt_deg: float  #: of the fitted plane
     area_m2: float  #: of all cells with a height, seen from above
     surface_m2: Measured  #: area of the surface at the chosen grain
@@ -94,13 +99,13 @@ def survey_products(
     surfaces = [z, blurred, *(z + field for field in errors.samples(_N_FIELDS, seed=1))]
     grains = tuple(_at_grain(surfaces, cell_m, n, tilt_deg) for n in usable)
     chosen = next((k for k, grain in enumerate(grains) if grain.is_reliable), len(grains) - 1)
-    area_m2, rugosity = float(known.sum()) * cell_m**2, grains[chosen].rugosity
-    surface = _with_scale(rugosity.value * area_m2, rugosity.sigma.scaled(area_m2), 2 * scale_sigma)
+    area_m2 = float(known.sum()) * cell_m**2
+    surface = grains[chosen].rugosity.times(area_m2, 2 * scale_sigma)
     level = float(np.quantile(z[known], _LEVEL_QUANTILE)) if level_m is None else level_m
     random, correlated = (float(np.sqrt(part[0, 0])) for part in errors.covariances(known[None] * cell_m**2))
     volume_m3 = float(np.sum(z[known] - level)) * cell_m**2
     sigma = SigmaParts(random, correlated, area_m2 * float(errors.long_sigma_m.max()))  # the level has an error, too
-    volume = _with_scale(volume_m3, sigma, 3 * scale_sigma)
+    volume = Measured(volume_m3, sigma).times(1.0, 3 * scale_sigma)
     return SurveyProducts(grains, chosen, tilt_deg, area_m2, surface, level, volume)
 
 
@@ -110,8 +115,7 @@ def _at_grain(surfaces: list[Layer], cell_m: float, n: int, tilt_deg: float) -> 
     functions = surface_ratio, slope_deg, ruggedness
     measured = [_measured([float(np.nanmean(function(z, n * cell_m))) for z in coarse]) for function in functions]
     (rugosity, noise, resolution), (slope, *_), (rugged, *_) = measured
-    flat = float(np.cos(np.deg2rad(tilt_deg)))
-    on_plane = Measured(rugosity.value * flat, rugosity.sigma.scaled(flat))
+    on_plane = rugosity.times(float(np.cos(np.deg2rad(tilt_deg))))
     return GrainProducts(n * cell_m, rugosity, on_plane, slope, rugged, noise, resolution)
 
 
@@ -125,7 +129,3 @@ def _measured(values: list[float]) -> tuple[Measured, float, float]:
     value = raw - noise
     sigma = SigmaParts(float(np.std(noisy, ddof=1)), 0.0, float(np.hypot(noise, resolution)))
     return Measured(value, sigma), noise / (value or 1.0), resolution / (value or 1.0)
-
-
-def _with_scale(value: float, sigma: SigmaParts, scale_sigma: float) -> Measured:
-    return Measured(value, sigma._replace(systematic=float(np.hypot(sigma.systematic, scale_sigma * value))))
