@@ -74,16 +74,11 @@ def cast_camera_ray(field, pose, a, b):
     return cast_ray(field, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz)
 
 
-def beam_rays(beam_deg: float) -> Array:
-    """Returns normalised points (n, 2) in the beam of a width [deg] around the optical axis."""
-    rings = np.tan(np.deg2rad(beam_deg / 2)) * np.arange(1, _BEAM_RINGS + 1) / _BEAM_RINGS
+def nearest_echo_m(field: HeightField, world_from_camera: Array, beam_deg: float) -> float:
+    """Returns the distance to the nearest of the points where rays of a beam around the optical axis meet the floor."""
+    radii = np.tan(np.deg2rad(beam_deg / 2)) * np.arange(_BEAM_RINGS + 1) / _BEAM_RINGS
     angles = np.arange(_BEAM_RAYS) * (2 * np.pi / _BEAM_RAYS)
-    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return np.concatenate([np.zeros((1, 2)), *(radius * ring for radius in rings)])
-
-
-def nearest_echo_m(field: HeightField, world_from_camera: Array, rays: Array) -> float:
-    """Returns the distance to the nearest point at which the floor is met by rays (n, 2) of a beam [m]; inf: none."""
+    rays = np.stack([np.outer(radii, np.cos(angles)).ravel(), np.outer(radii, np.sin(angles)).ravel()], axis=1)
     depths = [cast_camera_ray(field, world_from_camera, a, b) for a, b in rays.tolist()]
     return float(np.min(np.array(depths) * np.sqrt(1 + (rays**2).sum(axis=1))))
 

@@ -101,21 +101,18 @@ def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> floa
 
 
 def lasting_residuals(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> dict[str, float]:
-    """Returns the RMS, relative to their noise, of the residuals that the readings of a sensor share, by its name.
+    """Returns by sensor the RMS of the residuals that successive readings share / their noise, where significant.
 
-    The mean product of whitened residuals at successive nodes is 0 for white noise, with the standard deviation v /
-    sqrt(number of products) for its variance v, half the mean squared difference (von Neumann 1941), at least 1. Where
-    the path is bent or turned, or the sensor is biased, it is the variance of that error. Sensors for which it is not
-    significant are left out.
+    The mean product of n pairs of white residuals is 0 with the standard deviation v / sqrt(n), for their variance v,
+    half the mean squared difference (von Neumann 1941). The excess is the variance of errors of path or sensor.
     """
     poses, found = np.array([node.world_from_camera for node in nodes]).reshape(-1, 4, 4), dict[str, float]()
     for name, factors in zip(("pressure", "AHRS", "USBL"), unary_factors(nodes, rig, noise)[:3], strict=True):
         if len(factors.pose_index) > 1:
             whitened = factors.residuals(poses[factors.pose_index]) @ np.linalg.cholesky(factors.information[0])
-            products = whitened[1:] * whitened[:-1]
-            variance = max(float((np.diff(whitened, axis=0) ** 2).mean()) / 2, 1.0)
-            if products.mean() > SIGNIFICANT * variance / np.sqrt(products.size):
-                found[name] = float(np.sqrt(products.mean()))
+            shared, variance = whitened[1:] * whitened[:-1], float((np.diff(whitened, axis=0) ** 2).mean()) / 2
+            if shared.mean() > SIGNIFICANT * max(variance, 1.0) / np.sqrt(shared.size):
+                found[name] = float(np.sqrt(shared.mean()))
     return found
 
 

@@ -467,17 +467,16 @@ class Navigator:
     def with_tested_sigma(
         self, result: SurveyResult, elevation: ElevationMap, chosen: NDArray[np.bool_] | None = None
     ) -> ElevationMap:
-        """Returns the map of `build_map`, tested with the maps of the legs there and back (`with_scatter`).
+        """Returns the map of `build_map`, tested with maps of the legs there and back (`with_scatter`).
 
         Unchanged without images. Raises OSError if an image could not be read.
         """
         turned, linked, _ = _linked_in_map(result, chosen)
         if len(linked) < 2 or self.vision.left_image(int(turned.keyframe_rows[0])) is None:
             return elevation
-        back = flown_back(turned.final.positions[turned.keyframe_rows])
-        sets = np.flatnonzero(back), np.flatnonzero(~back)
-        parts = [(_of_keyframes(turned, part), steps_between(result.step_cov, linked[part])) for part in sets]
-        maps = [self.vision.build_map(part, elevation.grid, steps, _ignore) for part, steps in parts]
+        back, step_cov = flown_back(turned.final.positions[turned.keyframe_rows]), result.step_cov
+        sets = [(_of_keyframes(turned, part), steps_between(step_cov, linked[part])) for part in (back, ~back)]
+        maps = [self.vision.build_map(part, elevation.grid, steps, _ignore) for part, steps in sets]
         return with_scatter(elevation, *maps)
 
     def build_tiles(
@@ -557,7 +556,7 @@ def _linked_in_map(
     return replace(_of_keyframes(result, linked), final=turned), linked, map_from_world
 
 
-def _of_keyframes(result: SurveyResult, chosen: NDArray[np.int64]) -> SurveyResult:
+def _of_keyframes(result: SurveyResult, chosen: NDArray[Any]) -> SurveyResult:
     """Returns a result with the chosen keyframes only; its links keep the numbers of all keyframes."""
     return replace(
         result,

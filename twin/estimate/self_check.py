@@ -23,7 +23,7 @@ MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correcti
 MAX_ROW_PATTERN_PX = 0.1  # systematic row difference that pitch, yaw, roll and a row offset do not explain, RMS
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_DISPARITY_OFFSET_PX = 0.08  # offset of all disparities, estimated from the motions between keyframes
-MAX_DISTORTION_PX = 0.3  # disparity error by a radial distortion, and by the yaw that is estimated in its place
+MAX_DISTORTION_PX = 0.2  # disparity error by a radial distortion, and by the yaw that is estimated in its place
 MAX_LASTING = 1.0  # RMS of the residuals that successive readings of a sensor share / standard deviation of a reading
 MAX_SCALE_ERROR = 0.01  # relative difference of lengths from the images and from navigation sensors
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
@@ -133,10 +133,7 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
         text = f"{sensor} readings contradicted the estimates for long, and {end}"
         yield from _above(f"readings_{sensor}", count, 0, text)
     for sensor, ratio in quality.lasting_residuals.items():
-        text = (
-            f"the path differs from the {sensor} readings by {ratio:.1f} times their standard deviation for long: it is"
-            " bent or turned, or the sensor has an error"
-        )
+        text = f"the path differs from the {sensor} readings for long, by {ratio:.1f} times their standard deviation"
         yield from _above(f"lasting_{sensor}", ratio, MAX_LASTING, text)
 
 

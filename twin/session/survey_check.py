@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.core.height_field import beam_rays, map_height_field, nearest_echo_m
+from twin.core.height_field import map_height_field, nearest_echo_m
 from twin.core.quality import Finding, LengthScale
 from twin.core.records import Array, ElevationMap, StereoRig, SurveyResult
 from twin.estimate.self_check import MAX_ROW_OFFSET_PX, check_survey
@@ -25,21 +25,19 @@ def survey_findings(
 
 
 def with_altimeter_scale(mission: Mission, result: SurveyResult, elevation: ElevationMap | None) -> SurveyResult:
-    """Returns a result whose scale along the optical axis is that by the altimeter, if this is the most precise one.
+    """Returns a result whose scale along the optical axis is that by the altimeter, if it has been read.
 
     It is the mean ratio of the distances to the map along the beam of the altimeter to its readings.
     """
-    quality, beam = result.quality, beam_rays(mission.scenario.navigation.altimeter_beam_deg)
+    quality, beam_deg = result.quality, mission.scenario.navigation.altimeter_beam_deg
     if elevation is None or not np.isfinite(elevation.height_m).any():
         return result
     floor, poses = map_height_field(elevation.height_m, elevation.grid), result.final.world_from_camera
-    ratios = [nearest_echo_m(floor, poses[row], beam) / read_m for row, read_m in quality.altimeter_m.items()]
+    ratios = [nearest_echo_m(floor, poses[row], beam_deg) / read_m for row, read_m in quality.altimeter_m.items()]
     known = np.array(ratios)[np.isfinite(ratios)]
     if len(known) < 2:
         return result
     scale = LengthScale(float(known.mean()), float(known.std(ddof=1) / np.sqrt(len(known))), "the altimeter")
-    if quality.depth_scale is not None and quality.depth_scale.sigma < scale.sigma:
-        return result
     return replace(result, quality=quality._replace(depth_scale=scale))
 
 

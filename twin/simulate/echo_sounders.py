@@ -3,7 +3,7 @@
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.height_field import HeightField, beam_rays, cast_ray, nearest_echo_m
+from twin.core.height_field import HeightField, cast_ray, nearest_echo_m
 from twin.scenario.model import NavigationConfig
 
 _LEAST_BEAMS = 3  # of the DVL, which determine a velocity
@@ -14,12 +14,11 @@ class Altimeter:
 
     def __init__(self, settings: NavigationConfig, floor: HeightField, rng: np.random.Generator):
         self._settings, self.floor, self._rng = settings, floor, rng
-        self._rays = beam_rays(settings.altimeter_beam_deg)
 
     def read(self, world_from_camera: Array) -> float | None:
         """Returns the distance to the floor [m]; None outside the range of the sensor."""
         number = float(self._rng.standard_normal())
-        distance_m = nearest_echo_m(self.floor, world_from_camera, self._rays)
+        distance_m = nearest_echo_m(self.floor, world_from_camera, self._settings.altimeter_beam_deg)
         nearest_m, farthest_m = self._settings.altimeter_range_m
         if not nearest_m <= distance_m <= farthest_m:
             return None

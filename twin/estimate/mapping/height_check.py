@@ -9,14 +9,13 @@ from twin.core.geometry import Array
 from twin.core.records import ElevationMap
 
 MIN_COMMON = 200  # cells with heights from both sets that a comparison needs
-_ONE_WAY = 0.2  # a path with a smaller share of keyframes in one of the two directions has no legs there and back
+_ONE_WAY = 0.2  # share of the keyframes in one of two directions below which a path has no legs there and back
 
 
 def flown_back(positions_m: Array) -> NDArray[np.bool_]:
-    """Returns which of the keyframes (n,) at positions (n, 3) were taken on the legs against the direction of most.
+    """Returns which keyframes (n,) at positions (n, 3) are on legs back, or every other one if there are no such legs.
 
-    Legs there and back are neighbours: they show a point at different field angles, so that errors of distortion and
-    pose change their heights differently. Every other keyframe is chosen where the path has no such legs.
+    Legs there and back show a point at different field angles, where errors of distortion and pose differ.
     """
     step_m = np.gradient(positions_m, axis=0)
     back = step_m @ np.linalg.svd(step_m, full_matrices=False)[2][0] < 0
@@ -24,15 +23,13 @@ def flown_back(positions_m: Array) -> NDArray[np.bool_]:
 
 
 def with_scatter(elevation: ElevationMap, one: ElevationMap, other: ElevationMap) -> ElevationMap:
-    """Returns a map with the scatter of the heights from two disjoint sets of its keyframes, on its grid.
+    """Returns a map with the RMS difference / standard deviation of heights from two sets of keyframes, on its grid.
 
-    The scatter is the RMS of their differences / standard deviation. If it is above 1, the standard deviations are
-    multiplied by it, as by the scale factor of Birge (Phys. Rev. 40, 207, 1932). Unchanged with fewer than `MIN_COMMON`
-    common cells.
+    If it is above 1, the standard deviations are multiplied by it, the scale factor of Birge (Phys. Rev. 40, 207,
+    1932). Unchanged with fewer than `MIN_COMMON` common cells.
     """
     ratio = (one.height_m - other.height_m) / np.hypot(one.sigma_m, other.sigma_m)
-    ratio = ratio[np.isfinite(ratio)].astype(np.float64)
-    if len(ratio) < MIN_COMMON:
+    if np.isfinite(ratio).sum() < MIN_COMMON:
         return elevation
-    scatter = float(np.sqrt(np.mean(ratio**2)))
+    scatter = float(np.sqrt(np.nanmean(ratio.astype(np.float64) ** 2)))
     return replace(elevation, sigma_m=elevation.sigma_m * np.float32(max(scatter, 1.0)), scatter=scatter)
