@@ -327,6 +327,20 @@ def test_link_errors_are_consistent_with_their_covariance(reef, bias_fraction, g
     assert np.mean(nees) == pytest.approx(1.0, abs=0.15)
 
 
+def test_links_sampled_together_are_those_sampled_one_by_one(reef):
+    poses, at = [tilted(0.1 * k, 0.05 * k, 2.0) for k in range(4)], [0]
+    vision = SurrogateVision(reef, MODEL, lambda: poses[at[0]], Stopwatch())
+    observe_keyframes(vision, poses, at)
+    nodes = [SimpleNamespace(number=k, yaw_rad=0.0) for k in range(4)]
+    together = vision.sample_links(nodes[3], nodes[2::-1], MODEL)
+    for motion, k in zip(together, (2, 1, 0), strict=True):
+        alone = link_of(vision, k, 3)
+        np.testing.assert_array_equal(motion.a_from_b, alone.a_from_b)
+        np.testing.assert_array_equal(motion.cov, alone.cov)
+        assert motion[2:4] == alone[2:4]
+    assert not np.array_equal(together[0].cov, together[1].cov)
+
+
 def test_lamps_scale_errors_of_links_and_daylight_does_not(reef):
     """A growth of 2 multiplies the variances by 1 + 2^2 under lamps alone. The random numbers are the same."""
     plain = MODEL._replace(match_floor_px=0.2, efficiency=0.0, lamp_growth=0.0)
