@@ -56,7 +56,7 @@ NETWORKS = {
 def factor_of(symbolic, diagonal, off):
     matrix = block_cholesky.BlockMatrix.allocate(symbolic)
     matrix.panels[:] = np.nan  # initial values are not used
-    matrix.clear()
+    matrix.panels[:] = 0.0
     matrix.add(0, off[:3])
     matrix.add(3, off[3:])
     return matrix.factorise(diagonal)

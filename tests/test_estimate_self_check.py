@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from judge_synthetic import survey
 from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
 
 from twin.core import geometry
 from twin.core.quality import CalibrationEstimate, DisparityOffset, DistortionError, EpipolarError, EstimationQuality
@@ -304,6 +305,16 @@ def test_the_variance_grows_with_the_views_of_the_same_floor():
     once, often = (disparity_offset([DisparityOffset(1e-3, 1e-4)] * 40, 10, views, 277.0) for views in (1.0, 5.0))
     assert often.sigma == pytest.approx(once.sigma * (1 + 0.25 * 4) ** 0.5)
     assert mean_views(poses[:0], np.zeros(0), RIG) == 1.0
+
+
+def test_views_are_the_overlaps_of_rectangles_in_the_axes_of_each_camera():
+    rng = np.random.default_rng(5)
+    turns = Rotation.from_rotvec(rng.normal(0.0, 0.7, (20, 3))).as_matrix()
+    depth_m, poses = rng.uniform(1.0, 3.0, 20), np.tile(np.eye(4), (20, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = turns, rng.normal(0.0, 0.6, (20, 3))
+    seen = np.einsum("iba,ikb->ika", turns, poses[None, :, :3, 3] - poses[:, None, :3, 3]) / depth_m[:, None, None]
+    overlap = np.clip(1 - np.abs(seen[..., :2] * [RIG.fx_px / RIG.width_px, RIG.fy_px / RIG.height_px]), 0.0, None)
+    assert mean_views(poses, depth_m, RIG) == pytest.approx(overlap.prod(axis=2).sum() / 20, rel=1e-12)
 
 
 def test_offsets_that_contradict_each_other_are_uncertain():

@@ -4,6 +4,7 @@ import functools
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -286,8 +287,8 @@ def test_an_edge_does_not_change_the_unevenness_of_the_floor_around_it():
 
 def reseeded(vision, seed):
     """Returns the same vision with other random numbers."""
-    vision._rng, vision._link_key, vision._normals = np.random.default_rng(seed), seed, np.zeros((0, 6))
-    vision._n_used = 0
+    vision._rng, vision._normals, vision._n_used = np.random.default_rng(seed), np.zeros((0, 6)), 0
+    vision._link_start["state"]["key"][0] = seed
     vision._relief_noise = np.random.default_rng([seed, 1]).standard_normal(vision._relief_noise.shape)
     return vision
 
@@ -302,7 +303,7 @@ def observe_keyframes(vision, poses, at):
 
 def link_of(vision, i, j):
     """Returns the motion i_from_j between an earlier keyframe i and a later one j."""
-    return vision._sample_link(vision._keyframes[j], vision._keyframes[i], j, i, vision.model)
+    return vision.sample_links(SimpleNamespace(number=j, yaw_rad=0.0), [SimpleNamespace(number=i)], vision.model)[0]
 
 
 def error_of_link(vision, i, j):
@@ -324,6 +325,20 @@ def test_link_errors_are_consistent_with_their_covariance(reef, bias_fraction, g
         error = error_of_link(vision, 0, 1)
         nees.append(error @ np.linalg.solve(link_of(vision, 0, 1).cov, error) / 6)
     assert np.mean(nees) == pytest.approx(1.0, abs=0.15)
+
+
+def test_links_sampled_together_are_those_sampled_one_by_one(reef):
+    poses, at = [tilted(0.1 * k, 0.05 * k, 2.0) for k in range(4)], [0]
+    vision = SurrogateVision(reef, MODEL, lambda: poses[at[0]], Stopwatch())
+    observe_keyframes(vision, poses, at)
+    nodes = [SimpleNamespace(number=k, yaw_rad=0.0) for k in range(4)]
+    together = vision.sample_links(nodes[3], nodes[2::-1], MODEL)
+    for motion, k in zip(together, (2, 1, 0), strict=True):
+        alone = link_of(vision, k, 3)
+        np.testing.assert_array_equal(motion.a_from_b, alone.a_from_b)
+        np.testing.assert_array_equal(motion.cov, alone.cov)
+        assert motion[2:4] == alone[2:4]
+    assert not np.array_equal(together[0].cov, together[1].cov)
 
 
 def test_lamps_scale_errors_of_links_and_daylight_does_not(reef):
@@ -599,6 +614,7 @@ def test_a_survey_without_optional_outputs_loads_no_graphics_library(tmp_path):
     line = f"""
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from twin import survey
 from twin.scenario.file import load_scenario
 result = survey.run(load_scenario("reef", {SHORT!r}), Path({str(tmp_path / "run")!r}), outputs=None)

@@ -4,6 +4,7 @@ import functools
 import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -151,7 +152,7 @@ def test_sampled_links_separate_keyframe_bias_from_relief(bias_fraction, relief_
     vision = SurrogateVision(mission(), model, lambda: poses[at[0]], Stopwatch())
     found = {name: [] for name in ("images", "patches", "relief")}
     for seed in range(60):
-        vision._link_key = seed
+        vision._link_start["state"]["key"][0] = seed
         vision._rng = np.random.default_rng(seed)
         vision._relief_noise = np.random.default_rng([seed, 1]).standard_normal(vision._relief_noise.shape)
         for at[0], pose in enumerate(poses):
@@ -171,7 +172,7 @@ def tilted(x, y, z):
 
 def error_of_link(vision, i, j, model):
     later, earlier = vision._keyframes[j], vision._keyframes[i]
-    link = vision._sample_link(later, earlier, j, i, model)
+    link = vision.sample_links(SimpleNamespace(number=j, yaw_rad=0.0), [SimpleNamespace(number=i)], model)[0]
     return geometry.log(geometry.inverse(geometry.inverse(earlier.pose) @ later.pose) @ link.a_from_b)
 
 
@@ -218,7 +219,7 @@ def compare_survey(flown, true, seed):
     def true_pose():
         return world.world_from_camera
 
-    world.vision._rng, world.vision._link_key = np.random.default_rng(100 + seed), seed
+    world.vision._rng, world.vision._link_start["state"]["key"][0] = np.random.default_rng(100 + seed), seed
     compared = SurrogateVision(flown, COMPARED, true_pose, Stopwatch())
     vision = ComparisonVision(SimulatedImages(world.vision), compared, true_pose)
     navigator = navigator_with(flown, vision, Stopwatch())

@@ -38,11 +38,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 @overload
 def kernel(function: Function, /) -> Function: ...
 @overload
-def kernel(**options: Any) -> Callable[[Function], Function]: ...
+def kernel(*, allocates: bool = True, **options: Any) -> Callable[[Function], Function]: ...
 def kernel(function: Any = None, /, **options: Any) -> Any:
-    """Compiles a function with `numba.njit` (its `options`) without the interpreter's lock; keeps the code on disk."""
+    """Compiles a function with `numba.njit` (its `options`) without the interpreter's lock; keeps the code on disk.
+
+    A function that `allocates` no arrays does not count references, which take longer than the work of a short one.
+    """
     if function is None:
         return lambda decorated: kernel(decorated, **options)
+    options["_nrt"] = options.pop("allocates", True)
     dispatcher: Any = numba.njit(nogil=True, **options)(function)
     if cache_folder(Path(function.__code__.co_filename).resolve(), function.__module__) is not None:
         _enable_caching(dispatcher)

@@ -65,7 +65,7 @@ def _cast_directions(field, poses, directions):
     return depth
 
 
-@kernel
+@kernel(allocates=False)
 def cast_camera_ray(field, pose, a, b):
     """Returns the depth at which the ray through the normalised point (a, b) meets the floor; inf if it does not."""
     dx = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2]
@@ -83,7 +83,7 @@ def nearest_echo_m(field: HeightField, world_from_camera: Array, beam_deg: float
     return float(np.min(np.array(depths) * np.sqrt(1 + (rays**2).sum(axis=1))))
 
 
-@kernel
+@kernel(allocates=False)
 def cast_ray(field, ox, oy, oz, dx, dy, dz):
     """Returns the smallest t >= 0 at which the ray o + t d meets the floor; 0 if o lies below the floor.
 
@@ -118,7 +118,7 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
     return np.inf
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
     """Returns the least t in [start, end] where the ray meets the floor of a cell; inf if none, NaN if a corner is NaN.
 
@@ -165,7 +165,7 @@ def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
     return triangles[valid.reshape(-1)[triangles].all(axis=1)]
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def rises(south_west, south_east, north_west, north_east, east_part, north_part):
     """Returns the rise over a cell towards east and north of its triangle at a point, given as parts of the cell."""
     lower = east_part >= north_part
@@ -213,7 +213,7 @@ def _overlaps(field, first, second, camera, directions, cell):
     return result
 
 
-@kernel
+@kernel(allocates=False)
 def _share_seen(field, pose, camera, cell, x, y, z, depth):
     """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
 

@@ -13,16 +13,7 @@ from twin.core.geometry import Array
 from twin.core.links import Link, Links
 from twin.core.quality import CalibrationEstimate
 from twin.core.records import Mask, SensorNoise, StereoRig
-from twin.estimate.adjustment.pose_graph import (
-    BinaryFactors,
-    FactorGraph,
-    GraphState,
-    Solution,
-    UnaryFactors,
-    motion_factors,
-    optimise,
-    prior_factors,
-)
+from twin.estimate.adjustment import pose_graph
 from twin.estimate.navigation import aiding
 from twin.estimate.self_calibration import NOTHING_MEASURED, MeasuredErrors, SharedParameters, shared_parameters
 from twin.estimate.vision.stereo import Keyframe
@@ -75,9 +66,10 @@ def align(
     displacements = [kind for kind in [aiding.displacement_factors(nodes, rig)] if len(kind.i)]
     shared = shared_parameters(rig, noise, bool(displacements), measured)
     unary = [_anchor_factors(nodes, anchors), *aiding.unary_factors(nodes, rig, noise)]
-    graph = FactorGraph(len(nodes), unary, [_motion_factors(nodes, links, shared), *displacements], shared.prior)
-    start = GraphState(np.array([node.world_from_camera for node in nodes]), shared.prior.mean)
-    solution = optimise(graph, start, _ROUND_ITERATIONS)
+    binary = [_motion_factors(nodes, links, shared), *displacements]
+    graph = pose_graph.FactorGraph(len(nodes), unary, binary, shared.prior)
+    start = pose_graph.GraphState(np.array([node.world_from_camera for node in nodes]), shared.prior.mean)
+    solution = pose_graph.optimise(graph, start, _ROUND_ITERATIONS)
     for _ in range(_MAX_ROUNDS):
         outliers = _outliers(graph, solution.chi2[0])
         if not outliers.any():
@@ -86,11 +78,11 @@ def align(
         links, state = links.select(~outliers), solution.state
         del solution  # frees its Cholesky factor before the next one is allocated
         graph = graph._replace(binary=[_motion_factors(nodes, links, shared), *displacements])
-        solution = optimise(graph, state, _ROUND_ITERATIONS)
+        solution = pose_graph.optimise(graph, state, _ROUND_ITERATIONS)
     if not solution.converged:
         state = solution.state
         del solution
-        solution = optimise(graph, state, _MAX_ITERATIONS)
+        solution = pose_graph.optimise(graph, state, _MAX_ITERATIONS)
     poses, chi2, calibration = solution.state.poses, _mean_chi2(links, solution.chi2[0]), shared.estimate(solution)
     if marginals_of is None:
         draws = _draw_positions(solution)  # before the marginals, which overwrite the factor
@@ -104,22 +96,22 @@ def align(
     return AlignmentResult(poses, covs, dropped, chi2, solution.converged, calibration)
 
 
-def _anchor_factors(nodes: Sequence[Keyframe], anchors: dict[int, Array]) -> UnaryFactors:
+def _anchor_factors(nodes: Sequence[Keyframe], anchors: dict[int, Array]) -> pose_graph.UnaryFactors:
     """Returns the priors of the anchored nodes, at their initial poses."""
     anchored = [(k, node) for k, node in enumerate(nodes) if node.number in anchors]
-    return prior_factors(
+    return pose_graph.prior_factors(
         [k for k, _ in anchored],
         np.array([node.world_from_camera for _, node in anchored]).reshape(-1, 4, 4),
         np.array([anchors[node.number] for _, node in anchored]).reshape(-1, 6, 6),
     )
 
 
-def _motion_factors(nodes: Sequence[Keyframe], links: Links, shared: SharedParameters) -> BinaryFactors:
+def _motion_factors(nodes: Sequence[Keyframe], links: Links, shared: SharedParameters) -> pose_graph.BinaryFactors:
     index_of = {node.number: k for k, node in enumerate(nodes)}
-    return motion_factors(links, index_of, _HUBER, shared.effect_on(links))
+    return pose_graph.motion_factors(links, index_of, _HUBER, shared.effect_on(links))
 
 
-def _outliers(graph: FactorGraph, chi2: Array) -> Mask:
+def _outliers(graph: pose_graph.FactorGraph, chi2: Array) -> Mask:
     """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
 
     Not those below 1 % of the largest, which may have distorted them, nor those between consecutive nodes.
@@ -134,7 +126,7 @@ def _mean_chi2(links: Links, chi2: Array) -> float:
     return float(np.mean(chi2 * links.shared_by)) / 6 if len(chi2) else 0.0
 
 
-def _draw_positions(solution: Solution) -> Array:
+def _draw_positions(solution: pose_graph.Solution) -> Array:
     """Returns errors (n - 1, 3, `_DRAWS`) of the positions of all nodes but the first, the reference [m]."""
     rng = np.random.default_rng(0)
     parts = [solution.sample(_DRAWN_AT_ONCE, rng)[1:, 3:] for _ in range(_DRAWS // _DRAWN_AT_ONCE)]

@@ -29,6 +29,7 @@ from twin.estimate.link_selection import RECURRENCE
 from twin.estimate.navigation.aiding import unary_factors
 from twin.estimate.navigation.dvl import body_displacement
 from twin.estimate.vision.stereo import Keyframe
+from twin.kernels import kernel
 
 #: Largest median standard deviation of the offset from a single link at which the offset counts as observable [px].
 MAX_LINK_SIGMA_PX = 0.3
@@ -92,12 +93,20 @@ def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> floa
     It is the mean sum of a node's overlaps with all nodes, of poses (n, 4, 4) and median depths (n,). The overlap of
     two images is that of their rectangles on a plane parallel to the first one at its depth; rotations are neglected.
     """
-    images_per_unit = np.array([rig.fx_px / rig.width_px, rig.fy_px / rig.height_px])
-    views = []
-    for pose, depth in zip(world_from_camera, depth_m, strict=True):
-        shift = geometry.transform(geometry.inverse(pose), world_from_camera[:, :3, 3])[:, :2] / depth * images_per_unit
-        views.append(np.sum(np.prod(np.clip(1 - np.abs(shift), 0.0, None), axis=1)))
-    return float(np.mean(views)) if views else 1.0
+    per_unit = rig.fx_px / rig.width_px, rig.fy_px / rig.height_px
+    return float(_sum_of_overlaps(world_from_camera, depth_m, *per_unit)) / len(depth_m) if len(depth_m) else 1.0
+
+
+@kernel
+def _sum_of_overlaps(poses, depth_m, images_per_x, images_per_y):
+    total = 0.0
+    for i, r in enumerate(poses):
+        for k in range(len(poses)):
+            x, y, z = poses[k, 0, 3] - r[0, 3], poses[k, 1, 3] - r[1, 3], poses[k, 2, 3] - r[2, 3]
+            across = abs(r[0, 0] * x + r[1, 0] * y + r[2, 0] * z) / depth_m[i] * images_per_x
+            along = abs(r[0, 1] * x + r[1, 1] * y + r[2, 1] * z) / depth_m[i] * images_per_y
+            total += max(1 - across, 0.0) * max(1 - along, 0.0)
+    return total
 
 
 def lasting_residuals(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> dict[str, float]:

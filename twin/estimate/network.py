@@ -23,6 +23,7 @@ from twin.estimate.calibration_errors import row_pattern
 from twin.estimate.self_calibration import MeasuredErrors, fused
 from twin.estimate.vision.epipolar_calibration import NOTICEABLE_PX
 from twin.estimate.vision.stereo import Keyframe
+from twin.estimate.vision.two_view_motion import Motion
 from twin.estimate.vision_interface import Vision
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the world frame
@@ -37,11 +38,11 @@ class LinkAttempt(NamedTuple):
     """Result of the measurement of one link."""
 
     link: Link | None  #: None if the measurement failed
-    residual: float = np.nan  #: residual of the points divided by the expected one; NaN if the measurement failed
-    #: disparity_offset, yaw, distortion: see `Motion`; None if the points of the link do not determine it.
-    disparity_offset: DisparityOffset | None = None
-    yaw: YawEffect | None = None
-    distortion: DistortionError | None = None
+    motion: Motion | None  #: the measured motion
+
+    @property
+    def yaw(self) -> YawEffect | None:
+        return None if self.motion is None else self.motion.yaw
 
 
 @dataclass
@@ -53,7 +54,7 @@ class AlignmentHistory:
     #: before_ga, after_ga: positions (n, 3) of the keyframes just before and after each alignment of a track [m].
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
-    #: link_residuals, disparity_offsets, yaws, distortions: those of all `LinkAttempt`s, without None.
+    #: link_residuals, disparity_offsets, yaws, distortions: those of all `LinkAttempt`s, without None; NaN: failed.
     link_residuals: list[float] = field(default_factory=list[float])
     disparity_offsets: list[DisparityOffset] = field(default_factory=list[DisparityOffset])
     yaws: list[YawEffect] = field(default_factory=list[YawEffect])
@@ -135,15 +136,7 @@ class KeyframeNetwork:
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[LinkAttempt]:
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         return [
-            LinkAttempt(None)
-            if motion is None
-            else LinkAttempt(
-                link_selection.to_link(node, other, overlap, motion),
-                motion.residual,
-                motion.disparity_offset,
-                motion.yaw,
-                motion.distortion,
-            )
+            LinkAttempt(motion and link_selection.to_link(node, other, overlap, motion), motion)
             for (other, overlap), motion in zip(others, motions, strict=True)
         ]
 
@@ -195,10 +188,11 @@ class KeyframeNetwork:
                 raise
             self._pending.popleft()
             self.links.add(links + bridge)
-            self.history.link_residuals += [attempt.residual for attempt in attempts]
-            self.history.disparity_offsets += [a.disparity_offset for a in attempts if a.disparity_offset is not None]
-            self.history.yaws += [attempt.yaw for attempt in attempts if attempt.yaw is not None]
-            self.history.distortions += [a.distortion for a in attempts if a.distortion is not None]
+            self.history.link_residuals += [np.nan if a.motion is None else a.motion.residual for a in attempts]
+            motions = [attempt.motion for attempt in attempts if attempt.motion is not None]
+            self.history.disparity_offsets += [m.disparity_offset for m in motions if m.disparity_offset is not None]
+            self.history.yaws += [motion.yaw for motion in motions if motion.yaw is not None]
+            self.history.distortions += [motion.distortion for motion in motions if motion.distortion is not None]
 
     def align_window(self, track: int) -> Array | None:
         """Aligns the nodes of the window of tracks that ends with `track`, and rebuilds the mosaic from this track.

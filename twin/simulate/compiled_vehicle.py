@@ -75,7 +75,7 @@ class CompiledVehicle:
     @property
     def twist_body(self) -> Array:
         """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s], at the time of the pose."""
-        return body_twist(self.state)
+        return body_twist(self.state.pose, self.state.velocity, self.state.acceleration, self.state.timestep_s)
 
     def step(self, command: Array, duration_s: float) -> None:
         """Simulates `duration_s`, whole timesteps (else ValueError), under commands (n,) in [-1, 1].
@@ -91,21 +91,20 @@ class CompiledVehicle:
         self._time_s += duration_s
         if (left := int(self.state.left[0])) >= 0:
             raise contact_error("the floor", self._time_s - left * self.state.timestep_s, self.state.pose)
-        if has_ended(self.state):
+        if has_ended(self.state.velocity, self.state.left):
             raise SurveyAborted(f"the physics diverged at {self._time_s:.3f} s")
 
 
 @kernel
-def body_twist(body):
-    velocity = body.velocity + 0.5 * body.timestep_s * body.acceleration
-    return twist_from_free_joint(body.pose[:3, :3], velocity)
+def body_twist(pose, velocity, acceleration, timestep_s):
+    return twist_from_free_joint(pose[:3, :3], velocity + 0.5 * timestep_s * acceleration)
 
 
 @kernel
-def has_ended(body):
+def has_ended(velocity, left):
     """Returns whether the hull touches the floor, or the physics diverged: a velocity is NaN or reaches a limit."""
-    speed, rate = np.abs(body.velocity[:3]).max(), np.abs(body.velocity[3:]).max()
-    return body.left[0] >= 0 or not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
+    speed, rate = np.abs(velocity[:3]).max(), np.abs(velocity[3:]).max()
+    return left[0] >= 0 or not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
 
 
 @kernel

@@ -13,10 +13,8 @@ _FIELDS = {"pressure": "pressure_z_m", "ahrs": "ahrs_rpy_rad", "usbl": "usbl_m"}
 _ROUNDING = 1e-9  # of times, relative to an interval
 
 
-def is_due(rate_hz: float | None, frames: NDArray[np.int64], frame_rate_hz: float) -> NDArray[np.bool_]:
-    """Returns for frames (n,), numbered from 0, whether a reading is due since the previous frame; None: at each."""
-    if rate_hz is None:
-        return np.ones(len(frames), np.bool_)
+def is_due(rate_hz: float, frames: NDArray[np.int64], frame_rate_hz: float) -> NDArray[np.bool_]:
+    """Returns for frames (n,), numbered from 0, whether a reading is due since the previous frame."""
     n_readings = np.floor(np.stack([frames - 1, frames]) * (rate_hz / frame_rate_hz) + _ROUNDING)
     return (n_readings[1] > n_readings[0]) | (frames == 0)
 

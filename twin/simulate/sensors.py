@@ -94,7 +94,8 @@ class NavigationSensors:
         numbers = navigation[:, :1], navigation[:, 1:], dvl
         rates_hz = settings.pressure_rate_hz, settings.ahrs_rate_hz, settings.dvl_rate_hz
         for rate_hz, of_sensor in zip(rates_hz, numbers, strict=True):
-            of_sensor[~is_due(rate_hz, frames, self._frame_rate_hz)] = np.nan
+            if rate_hz is not None:
+                of_sensor[~is_due(rate_hz, frames, self._frame_rate_hz)] = np.nan
         return navigation, dvl
 
     def _acoustic_fix(self, time_s: float, position_m: Array) -> Array | None:

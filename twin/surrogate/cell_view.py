@@ -82,18 +82,15 @@ def visible_cells(cells, cameras, window, true, estimated):
     first_row, end_row, first_col, end_col = window
     most = max(end_row - first_row, 0) * max(end_col - first_col, 0)
     found, values, n = np.empty(most, np.int64), np.empty((3, most)), 0
-    camera_from_world, right = geometry.inverse(true), _right_camera(cameras, true)
+    camera_from_world, right, information = geometry.inverse(true), _right_camera(cameras, true), cameras.information
     for row in range(first_row, end_row):
-        for col in range(first_col, end_col):
-            cell = row * cells.cols + col
+        for cell in range(row * cells.cols + first_col, row * cells.cols + end_col):
             at = _source(cells, cameras, cell, camera_from_world, estimated)
             depth_m, u, v, border_px = _seen(cells, cameras, cell, at, camera_from_world, true, right)
             if border_px < 0:
                 continue
             found[n], values[0, n], values[1, n] = cell, depth_m, border_px
-            values[2, n] = _interpolated(
-                cameras.information, (u + 0.5) / cameras.width_px, (v + 0.5) / cameras.height_px
-            )
+            values[2, n] = _interpolated(information, (u + 0.5) / cameras.width_px, (v + 0.5) / cameras.height_px)
             n += 1
     return found[:n], values[0, :n].copy(), values[1, :n].copy(), values[2, :n].copy()
 
@@ -117,7 +114,7 @@ def _right_camera(cameras, true):
     return right
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _seen(cells, cameras, cell, point, camera_from_world, left, right):
     """Returns depth, column and row of a cell's floor point in the left image, and its distance from the next border.
 
@@ -207,7 +204,7 @@ def extend_runs(runs, index, border_px, information, following, squared_step):
     return ended[:n], of_ended
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _source(cells, cameras, cell, camera_from_world, estimated):
     """Returns the true floor point that is mapped to a cell: its centre minus the mapping error.
 
@@ -221,13 +218,13 @@ def _source(cells, cameras, cell, camera_from_world, estimated):
     return x - right, y - up, z - (cells.slope[cell, 0] * right + cells.slope[cell, 1] * up)
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _centre(cells, cell):
     x = cells.west_m + (cell % cells.cols + 0.5) * cells.cell_m
     return x, cells.north_m - (cell // cells.cols + 0.5) * cells.cell_m, np.float64(cells.height_m[cell])
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _mapped(cameras, camera_from_world, estimated, point):
     """Returns the estimated position of a world point that a keyframe sees."""
     x, y, d = _normalised(camera_from_world, cameras.baseline_m, point)
@@ -235,7 +232,7 @@ def _mapped(cameras, camera_from_world, estimated, point):
     return _transformed(estimated, seen[0], seen[1], 1.0, cameras.estimated_baseline_m / seen[2])
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _normalised(camera_from_world, baseline_m, point):
     """Returns normalised x, y and disparity of a world point; NaN for a point behind the camera."""
     x, y, z = _transformed(camera_from_world, point[0], point[1], point[2], 1.0)
@@ -243,7 +240,7 @@ def _normalised(camera_from_world, baseline_m, point):
     return x / z, y / z, baseline_m / z
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _transformed(pose, x, y, z, scale):
     return (
         (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z) * scale + pose[0, 3],
@@ -252,7 +249,7 @@ def _transformed(pose, x, y, z, scale):
     )
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _interpolated(table, across, down):
     """Returns the value of a table (rows, cols) of blocks of the image, interpolated between their centres."""
     rows, cols = table.shape

@@ -68,9 +68,8 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
     steps, variances = np.empty((n, 6)), np.empty((n, 6))
     for k in range(n):
         geometry.copy_into(true[k], geometry.compose(body.pose, sensors.body_from_camera))
-        height, angles, velocity = read_per_frame_sensors(
-            sensors, body.pose, body_twist(body), sensor_normals[k], dvl_normals[k]
-        )
+        twist = body_twist(body.pose, body.velocity, body.acceleration, body.timestep_s)
+        height, angles, velocity = read_per_frame_sensors(sensors, body.pose, twist, sensor_normals[k], dvl_normals[k])
         a_from_b = sample_f2f_motion(
             errors, last, true[k], vision_normals[k], last_normals if k == 0 else vision_normals[k - 1]
         )
@@ -83,6 +82,6 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
         twist = geometry.log(motion) * (1 / interval_s)  # bit-identical to `Navigator.update`
         command = steer(pilot, state.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
         advance(body, command, n_steps)
-        if has_ended(body):
+        if has_ended(body.velocity, body.left):
             return k + 1, state, true, f2f, online, steps, variances
     return n, state, true, f2f, online, steps, variances

@@ -19,16 +19,7 @@ from twin.core.quality import CalibrationEstimate
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
-from twin.surrogate.cell_view import (
-    Cameras,
-    FloorCells,
-    extend_runs,
-    mapped_heights,
-    mark_visible,
-    pose_variances,
-    visible_cells,
-    window_in_reach,
-)
+from twin.surrogate import cell_view
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_relief import Map, floor_relief
 from twin.surrogate.height_errors import CellConditions, HeightSigmas, KeyframeRuns, cell_conditions, height_sigmas
@@ -89,11 +80,11 @@ class MapModel:
         self.grid, self.height_m, self.seen = grid, height_m, np.zeros(height_m.shape, np.bool_)
         self._rig, self._matchability = rig, matchability
         self.relief = floor_relief(height_m, grid.cell_m, rig, matchability.medium_depth_m)
-        self._cells = FloorCells(
+        self._cells = cell_view.FloorCells(
             grid.west_m, grid.north_m, grid.cell_m, grid.rows, grid.cols, np.ascontiguousarray(height_m.ravel()),
             self.relief.slope.reshape(-1, 2), _may_be_hidden(height_m, grid.cell_m).ravel(), floor,
         )  # fmt: skip
-        self._cameras = Cameras(
+        self._cameras = cell_view.Cameras(
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), rig.baseline_m, view.table,
             rig.baseline_m, 1 / np.square(matchability.dependence.bounds),
         )  # fmt: skip
@@ -127,27 +118,22 @@ class MapModel:
 
     def mark_seen(self, world_from_camera: Array) -> None:
         """Marks the cells that both cameras see from the true pose (4, 4) of a keyframe."""
-        window = window_in_reach(self._cells, self._cameras, self._lowest_m, world_from_camera)
-        mark_visible(self._cells, self._cameras, window, world_from_camera, self.seen.reshape(-1))
+        window = cell_view.window_in_reach(self._cells, self._cameras, self._lowest_m, world_from_camera)
+        cell_view.mark_visible(self._cells, self._cameras, window, world_from_camera, self.seen.reshape(-1))
 
     def observe(self, true: Array, estimated: Array) -> ObservedCells:
         """Returns the cells that a keyframe with a true and an estimated pose (4, 4) observes.
 
         With calibration errors or an approximated port, the estimated pose determines which point is mapped to a cell.
         """
-        window = window_in_reach(self._cells, self._cameras, self._lowest_m, true)
-        found = visible_cells(self._cells, self._cameras, window, true, estimated)
+        window = cell_view.window_in_reach(self._cells, self._cameras, self._lowest_m, true)
+        found = cell_view.visible_cells(self._cells, self._cameras, window, true, estimated)
         return ObservedCells(*found, true, estimated)
 
     def sample_patch(
-        self,
-        observed: ObservedCells,
-        following: ObservedCells | None,
-        cov: Array,
-        model: ErrorModel,
-        noise: MapNoise,
+        self, observed: ObservedCells, following: ObservedCells | None, cov: Array, model: ErrorModel, noise: MapNoise,
         rng: np.random.Generator,
-    ) -> HeightPatch | None:
+    ) -> HeightPatch | None:  # fmt: skip
         """Samples the heights of the cells that a keyframe sees and the next one does not; None if it sees none.
 
         The keyframes must be passed in the order of the path: the consecutive keyframes that observed a cell determine
@@ -176,7 +162,7 @@ class MapModel:
         ):  # fmt: skip
             error += sigma_m * normal.ravel()[index]
         height, variance, systematic = np.full((3, *shape), np.nan, np.float32)
-        mapped_m = mapped_heights(self._cells, self._cameras, index, observed.true, observed.estimated)
+        mapped_m = cell_view.mapped_heights(self._cells, self._cameras, index, observed.true, observed.estimated)
         height[i, k] = mapped_m + error
         variance[i, k] = typical_m**2
         systematic[i, k] = self._pose_variances(observed.estimated, cov, index) + lateral_m**2
@@ -192,7 +178,7 @@ class MapModel:
         if following is not None:
             step_m = float(np.linalg.norm(following.true[:3, 3] - observed.true[:3, 3]))
             following_index, squared_step = following.cells, (step_m / self._rig.baseline_m) ** 2
-        ended, (number, squared_steps, border_px, information) = extend_runs(
+        ended, (number, squared_steps, border_px, information) = cell_view.extend_runs(
             self._runs, index, observed.border_px, observed.information, following_index, squared_step
         )
         last, step = index[ended], np.sqrt(squared_steps / np.maximum(number - 1, 1))
@@ -205,7 +191,7 @@ class MapModel:
     def _pose_variances(self, estimated: Array, cov: Array, index: Index) -> Array:
         """Returns the variances (n,) of the heights due to the error of a pose, with `cov` (6, 6) in its axes."""
         rotation = geometry.adjoint(geometry.pose(estimated[:3, :3], np.zeros(3)))
-        return pose_variances(self._cells, index, estimated[:3, 3], rotation @ cov @ rotation.T)
+        return cell_view.pose_variances(self._cells, index, estimated[:3, 3], rotation @ cov @ rotation.T)
 
     def _window(self, index: Index) -> tuple[int, int, tuple[int, int]]:
         rows, cols = index // self.grid.cols, index % self.grid.cols

@@ -213,8 +213,9 @@ class Matchability:
 
     def bound_at(self, depth_m: Array | float) -> Array:
         """Returns the bound [px of the binned images] at depths [m]: a parabola in logarithms, constant outside."""
-        depth_m = np.clip(depth_m, *self.depths_m[[0, -1]])
-        return np.exp(np.polyval(self._parabola, np.log(depth_m / self.medium_depth_m)))
+        depth_m, (a, b, c) = np.minimum(np.maximum(depth_m, self.depths_m[0]), self.depths_m[-1]), self._parabola
+        x = np.log(depth_m / self.medium_depth_m)
+        return np.exp((a * x + b) * x + c)
 
     @cached_property
     def _parabola(self) -> Array:

@@ -164,17 +164,14 @@ def _flow(points: Array, baseline_m: float, image_of) -> Array:
     depth_m = baseline_m / points[:, 2:]
     xyz = np.column_stack([points[:, :2], np.ones(len(points))]) * depth_m
     scale = _STEP_DEPTHS * np.append(np.ones(3), np.full(3, float(np.median(depth_m))))
-    columns = []
-    for step in np.diag(scale):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = geometry.transform(geometry.inverse(geometry.exp(sign * step)), xyz)
-            ends.append(image_of(np.column_stack([moved[:, :2] / moved[:, 2:], baseline_m / moved[:, 2]])))
-        columns.append((ends[0] - ends[1]).ravel() / (2 * step.sum()))
-    return np.column_stack(columns)
+    steps = [sign * step for sign in (1.0, -1.0) for step in np.diag(scale)]
+    moved = np.concatenate([geometry.transform(geometry.inverse(geometry.exp(step)), xyz) for step in steps])
+    images = image_of(np.column_stack([moved[:, :2] / moved[:, 2:], baseline_m / moved[:, 2]]))
+    ahead, back = images.reshape(2, len(scale), 2 * len(points))
+    return ((ahead - back) / (2 * scale[:, None])).T
 
 
-@kernel
+@kernel(allocates=False)
 def measure_point(table, x, y, disparity):
     """Returns the measured x, y, disparity and row difference of a true point; the table is extrapolated linearly."""
     m0, m1, m2, m3 = x, y, disparity, 0.0
@@ -185,7 +182,7 @@ def measure_point(table, x, y, disparity):
     return m0, m1 + turned / 2, m2 - table.yaw_rad * (1 + right * right), m3 + turned
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _interpolated(table, x, y, disparity):
     values = table.values
     n, rows, cols, _ = values.shape
@@ -206,7 +203,7 @@ def _interpolated(table, x, y, disparity):
     return m0, m1, m2, m3
 
 
-@kernel(inline="always")
+@kernel(allocates=False)
 def _interval(position, n):
     """Returns the index of the grid interval that contains a position, and the relative position in it."""
     k = min(max(int(np.floor(position)), 0), n - 2)

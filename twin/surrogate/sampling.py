@@ -28,6 +28,27 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
 
 
 @kernel
+def sample_links(
+    points, later_noise, earlier_noises, relief_noise, normals, earlier_poses, later_pose, camera, unit_cov, variances,
+    unit_root, sigmas, bias_fraction, relief_sigmas, distance_growth, common_sigma, noise_shares,
+):  # fmt: skip
+    """Samples the motions between a keyframe and m earlier ones: `sample_link` for each, with arrays of m items.
+
+    The reported covariances of a point are `unit_cov` times `variances` (m,), the factors of the true ones `unit_root`
+    times `sigmas` (m,). Returns arrays of the results of `sample_link`: (m,), (m, 4, 4), (m, 6, 6) and (m, 8).
+    """
+    m = len(earlier_poses)
+    counts, motions, covs, yaws = np.empty(m, np.int64), np.empty((m, 4, 4)), np.empty((m, 6, 6)), np.empty((m, 8))
+    for k in range(m):
+        counts[k], motions[k], covs[k], yaws[k] = sample_link(
+            points, later_noise, earlier_noises[k], relief_noise, normals[k], earlier_poses[k], later_pose, camera,
+            unit_cov * variances[k], unit_root * sigmas[k], bias_fraction, relief_sigmas[k], distance_growth,
+            common_sigma, noise_shares[k],
+        )  # fmt: skip
+    return counts, motions, covs, yaws
+
+
+@kernel
 def sample_link(
     points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
     bias_fraction, relief_sigma, distance_growth, common_sigma, noise_share,

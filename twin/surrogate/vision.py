@@ -33,7 +33,7 @@ from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.coverage import RENDERED, unmodelled
 from twin.surrogate.error_model import ErrorModel
-from twin.surrogate.map_model import MapModel
+from twin.surrogate.map_model import Index, MapModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import MeasuredRows, measured_view
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
@@ -56,7 +56,7 @@ class KeyframeTruth(NamedTuple):
 
     pose: Array  #: (4, 4) true pose
     points: Array  #: (n, 3) true normalised (x, y, disparity) of the raster points that are inside both images
-    raster_indices: NDArray[np.int64]  #: (n,) index of each point in the raster
+    raster_indices: Index  #: (n,) index of each point in the raster
     noise: Array  #: (rows, cols, 3) standard normal samples of the stereo errors of the raster points
     bound_px: float  #: Cramér-Rao bound of a patch's position
     unevenness_px: float  #: `Matchability.unevenness_at` its depth
@@ -149,7 +149,8 @@ class SurrogateVision:
         self.frame_errors: FrameErrors | None = None
         self._last_motion, self._blind_s = np.eye(4), 0.0  # blind: time without points to track
         self._mosaic = MosaicModel()
-        self._link_key = int(rng.integers(2**63))
+        self._link_rng = np.random.Generator(np.random.Philox(key=[int(rng.integers(2**63)), 0]))
+        self._link_start: Any = self._link_rng.bit_generator.state  # with the counter 0
         self._normals, self._n_used = np.zeros((0, 6)), 0
         self._relief_noise = rng.standard_normal((_RELIEF_CELLS, _RELIEF_CELLS, 2))
         origin = np.zeros((1, 2))
@@ -190,16 +191,17 @@ class SurrogateVision:
             depth_m = cast_pixels(self.floor, pose[None], self.rig, self._true_pixels)[0]
             hits = np.flatnonzero((depth_m > 0) & (depth_m < np.inf))  # 0: the camera is below the floor
             enough = len(hits) >= sampling.MIN_POINTS
-            seen, n_points = self._matched_points(hits, depth_m) if enough else (hits, 0.0)
+            mean_m = float(depth_m[hits].mean()) if enough else math.nan
+            seen, n_points = self._matched_points(hits, depth_m, mean_m) if enough else (hits, 0.0)
             if n_points < _MIN_POINTS or len(seen) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, int(n_points), None))
                 return None
             self._pose_at[row] = pose
-            return self._sample_stereo(pose, row, seen, depth_m, n_points, float(depth_m[hits].mean()))
+            return self._sample_stereo(pose, row, seen, depth_m, n_points, mean_m)
 
-    def _matched_points(self, hits: NDArray[np.int64], depth_m: Array) -> tuple[NDArray[np.int64], float]:
+    def _matched_points(self, hits: Index, depth_m: Array, mean_m: float) -> tuple[Index, float]:
         """Returns the raster points (n,) that are matched, of those that show the floor, and the number of matches."""
-        matchability, mean_m = self.matchability, float(depth_m[hits].mean())
+        matchability = self.matchability
         share = self.model.point_fraction(float(matchability.bound_at(mean_m))) * matchability.clear_share_at(mean_m)
         points = self._true_points(hits, depth_m)
         matched = np.ones(len(hits), np.bool_) if self._rows is None else self._rows.are_matched(points)
@@ -207,7 +209,7 @@ class SurrogateVision:
         return hits[matched & self._in_both_images(points)], n_points
 
     def _sample_stereo(
-        self, pose: Array, row: int, hits: NDArray[np.int64], depth_m: Array, n_points: float, mean_m: float
+        self, pose: Array, row: int, hits: Index, depth_m: Array, n_points: float, mean_m: float
     ) -> StereoPoints:
         """Samples the positions of the raster points `hits` in a stereo pair, and keeps the keyframe's truth."""
         points, rig, matchability = self._true_points(hits, depth_m), self.rig, self.matchability
@@ -233,7 +235,7 @@ class SurrogateVision:
         pixels, around_px = self._pixels[hits].astype(np.float32), rig.focal_px * measured[:, 2]
         return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
 
-    def _true_points(self, indices: NDArray[np.int64], depth_m: Array) -> Array:
+    def _true_points(self, indices: Index, depth_m: Array) -> Array:
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
     def _in_both_images(self, points: Array) -> NDArray[np.bool_]:
@@ -289,7 +291,8 @@ class SurrogateVision:
             self._mosaic.add(keyframe.number, keyframe.world_from_camera, cells)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        return self.sample_links(node, others, self.model)
+        with self.stopwatch("network"):
+            return self.sample_links(node, others, self.model)
 
     def epipolar_error(self) -> EpipolarError | None:
         return None if self._rows is None else self._rows.report()
@@ -303,53 +306,54 @@ class SurrogateVision:
             self._keyframes.pop(number, None)
 
     def sample_links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
-        with self.stopwatch("network"):
-            later = self._keyframes.get(node.number, self.latest)
-            return [
-                self._sample_link(later, self._keyframes[k.number], node.number, k.number, model, node.yaw_rad)
-                for k in others
-            ]
+        """Samples the motions of a node from earlier ones; None if too few points or too small a part are matched."""
+        if not others:
+            return []
+        later, earlier = self._keyframes.get(node.number, self.latest), [self._keyframes[k.number] for k in others]
+        n, lamp_factor = len(later.points), float(model.lamp_factor(self.matchability.lamp_share))
+        laws = [self._link_law(later, one, model) for one in earlier]
+        found, (_, _, sigma_px, scale, share) = list[Motion | None](), np.array(laws).T.copy()
+        counts, motions, covs, yaws = sampling.sample_links(
+            later.points, later.noise.reshape(-1, 3)[later.raster_indices],
+            np.array([one.noise for one in earlier]), self._relief_noise,
+            np.array([self._link_normals(node.number, k.number, n + 1) for k in others]),
+            np.array([one.pose for one in earlier]), later.pose,
+            (*self._camera, self.view.without_yaw(node.yaw_rad).table), self._unit_cov,
+            np.array([(law[2] * later.noise_ratio) ** 2 for law in laws]), self._unit_root, sigma_px * lamp_factor,
+            model.match_bias_fraction,
+            model.relief_gain * lamp_factor * later.unevenness_px / self.rig.focal_px * scale,
+            model.distance_growth, COMMON_BIAS_PX / self.rig.focal_px, share,
+        )  # fmt: skip
+        for k, (stereo_sigma_px, match_fraction, *_) in enumerate(laws):
+            n_matched = int(counts[k] / n * later.n_points * match_fraction)
+            if counts[k] < sampling.MIN_POINTS or n_matched < _MIN_POINTS or match_fraction < MIN_INLIER_SHARE:
+                found.append(None)
+                continue
+            # relief increases the variance of the difference of a match's two image positions, 2 sigma^2 without it
+            growth = 1 + (model.relief_gain * later.parallax_px(earlier[k].pose)) ** 2 / (2 * stereo_sigma_px**2)
+            residual = math.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
+            (turned_rad, sigma_rad), by_yaw = yaws[k, :2].tolist(), yaws[k, 2:]
+            yaw = YawEffect(node.yaw_rad + turned_rad, sigma_rad * growth**0.5, by_yaw, node.yaw_rad)
+            known = yaw if math.isfinite(sigma_rad) else None
+            found.append(Motion(motions[k], covs[k] * growth, n_matched, residual, yaw=known))
+        return found
 
-    def _sample_link(
-        self, later: KeyframeTruth, earlier: KeyframeTruth, number: int, other: int, model: ErrorModel,
-        yaw_rad: float = 0.0,
-    ) -> Motion | None:  # fmt: skip
-        """Samples the motion between two keyframes; None if too few points or too small a fraction are matched.
-
-        The images are corrected for a yaw of the right camera by `yaw_rad`.
+    def _link_law(self, later: KeyframeTruth, earlier: KeyframeTruth, model: ErrorModel) -> tuple[float, ...]:
+        """Returns the standard deviation of a match in one image [px], the fraction of points that are matched,
+        the standard deviation of the mean that a raster point represents [px], the ratio of both, and `noise_share`.
         """
-        n, parallax_px = len(later.points), later.parallax_px(earlier.pose)
-        bound_px = max(later.bound_px, earlier.bound_px)
-        stereo_sigma_px = model.match_sigma_px(bound_px, max(later.stereo_parallax_px, earlier.stereo_parallax_px))
+        n, bound_px = len(later.points), max(later.bound_px, earlier.bound_px)
+        sigma_px = model.match_sigma_px(bound_px, max(later.stereo_parallax_px, earlier.stereo_parallax_px))
         match_fraction = min(later.clear_share, earlier.clear_share) * model.rematched(bound_px)
         n_matches = later.n_points * match_fraction
-        inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
-        noise_scale, single = math.sqrt(n / n_matches * inflation), n / n_matches
-        sigma_px, lamp_factor = stereo_sigma_px * noise_scale, model.lamp_factor(self.matchability.lamp_share)
-        in_view, motion, cov, yaw = sampling.sample_link(
-            later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise,
-            self._link_normals(number, other, n + 1), earlier.pose, later.pose,
-            (*self._camera, self.view.without_yaw(yaw_rad).table),
-            self._unit_cov * (sigma_px * later.noise_ratio) ** 2, self._unit_root * (sigma_px * lamp_factor),
-            model.match_bias_fraction,
-            model.relief_gain * lamp_factor * later.unevenness_px / self.rig.focal_px * noise_scale,
-            model.distance_growth, COMMON_BIAS_PX / self.rig.focal_px, single,
-        )  # fmt: skip
-        n_matched = int(in_view / n * later.n_points * match_fraction)
-        if in_view < sampling.MIN_POINTS or n_matched < _MIN_POINTS or match_fraction < MIN_INLIER_SHARE:
-            return None
-        # relief increases the variance of the difference of a match's two image positions, 2 sigma^2 without it
-        growth = 1 + (model.relief_gain * parallax_px) ** 2 / (2 * stereo_sigma_px**2)
-        residual = math.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
-        found = Motion(motion, cov * growth, n_matched, residual)
-        if not math.isfinite(yaw[1]):
-            return found
-        return found._replace(yaw=YawEffect(yaw_rad + yaw[0], yaw[1] * growth**0.5, yaw[2:], yaw_rad))
+        scale = math.sqrt(n / n_matches * overlap_inflation(n_matches, self.rig, self.settings.patch_px))
+        return sigma_px, match_fraction, sigma_px * scale, scale, n / n_matches
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns standard normal numbers (n, 3) of a link, which depend on seed and keyframe numbers only."""
-        stream = np.random.Philox(key=[self._link_key, 0], counter=[0, 0, number, other])
-        return np.random.Generator(stream).standard_normal((n, 3))
+        self._link_start["state"]["counter"][2:] = number, other
+        self._link_rng.bit_generator.state = self._link_start
+        return self._link_rng.standard_normal((n, 3))
 
     def left_image(self, row: int) -> Image | None:
         return None

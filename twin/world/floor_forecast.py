@@ -1,6 +1,5 @@
 """Forecast of a survey over its floor: depth, footprint, overlap and coverage of the planned images by ray casting."""
 
-import sys
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from twin.world.observed_cells import seen_over
 from twin.world.planning import floor_of, planned_keyframes, thinned
 from twin.world.top_surface import with_objects
 
+_OVERLAP_PAIRS = 1000  #: largest number of pairs from which a median overlap is forecast
 _COVERAGE_CELLS = 1000  #: largest number of cells of the grid of the coverage along the longer side of the terrain
 
 
@@ -60,7 +60,7 @@ def planned_surface(mission: Mission) -> Terrain:
     return with_objects(mission.terrain, mission.objects)
 
 
-def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedOverlap:
+def planned_overlap(mission: Mission, most_pairs: int = _OVERLAP_PAIRS) -> PlannedOverlap:
     """Returns the median overlaps forecast from at most `most_pairs` along and across swaths; None without one."""
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
     pairs = (thinned(p, most_pairs) for p in image_pairs(keyframes, mission.plan.follows_floor))

@@ -80,9 +80,6 @@ class BlockMatrix(NamedTuple):
     def allocate(cls, symbolic: SymbolicFactor) -> BlockMatrix:
         return cls(symbolic, np.empty(symbolic.offset[-1]))
 
-    def clear(self) -> None:
-        self.panels[:] = 0.0
-
     def add(self, first: int, blocks: Array) -> None:
         """Adds blocks (k, 6, 6) to the k off-diagonal blocks from index `first`, in the order given to `analyse`."""
         _add(self.symbolic, first, blocks, self.panels)

@@ -231,7 +231,7 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
     corner = np.diag(graph.shared.sigma**-2)
     shared_gradient = corner @ (shared - graph.shared.mean)
     n_added = 0
-    matrix.clear()
+    matrix.panels[:] = 0.0
     for factors, residuals in zip(graph.unary, current.unary, strict=True):
         by_pose = factors.jacobians(current.state.poses[factors.pose_index], residuals)
         weighted = by_pose.transpose(0, 2, 1) @ factors.information
