@@ -27,6 +27,7 @@ from twin.core.records import (
     Frame,
     Image,
     MapGrid,
+    Mask,
     Readings,
     SensorNoise,
     StereoRig,
@@ -464,13 +465,8 @@ class Navigator:
         found = self.vision.build_map(turned, grid, steps, lambda n_done: report(n_done / len(linked)))
         return replace(found, map_from_world=map_from_world)
 
-    def with_tested_sigma(
-        self, result: SurveyResult, elevation: ElevationMap, chosen: NDArray[np.bool_] | None = None
-    ) -> ElevationMap:
-        """Returns the map of `build_map`, tested with maps of the legs there and back (`with_scatter`).
-
-        Unchanged without images. Raises OSError if an image could not be read.
-        """
+    def with_tested_sigma(self, result: SurveyResult, elevation: ElevationMap, chosen: Mask | None) -> ElevationMap:
+        """Returns the map of `build_map`, tested (`with_scatter`) if it is made of images; may raise OSError."""
         turned, linked, _ = _linked_in_map(result, chosen)
         if len(linked) < 2 or self.vision.left_image(int(turned.keyframe_rows[0])) is None:
             return elevation

@@ -44,10 +44,8 @@ class Estimation(NamedTuple):
         report = partial(self.progress, "map")
         try:
             found = self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))
-            if found is None:
-                return None
-            test = partial(self.navigator.with_tested_sigma, result, found, chosen)
-            return self.guard.attempt("height check", test) or found
+            test = self.navigator.with_tested_sigma
+            return found and (self.guard.attempt("height check", lambda: test(result, found, chosen)) or found)
         except OSError as error:
             self.guard.cause = self.guard.cause or str(error)
             return None
