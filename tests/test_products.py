@@ -104,6 +104,7 @@ def test_the_difference_of_two_cells_has_the_variance_of_the_spherical_model():
     assert errors.covariances(weights)[0][0, 0] == pytest.approx(2e-4 * (1 - 0.3125))
 
 
+@pytest.mark.long
 def test_samples_have_the_covariance_of_the_field():
     """Over 160 samples a standard deviation is known to 5.6 %."""
     errors = error_field(shape=(60, 60))
@@ -146,6 +147,7 @@ def test_the_registration_undoes_a_motion():
     assert np.nanstd(found.difference_m) < 5e-4
 
 
+@pytest.mark.long
 def test_the_errors_of_the_registration_are_those_of_its_covariance():
     """The mean of error^2 / variance is 1 for each parameter; over 14 pairs and 7 parameters it is known to 14 %."""
     errors, true_m = error_field(long_m=0.0), floor(*coordinates())
