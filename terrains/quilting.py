@@ -97,10 +97,7 @@ def _squared(a, b):
 
 @kernel
 def _join(target, block, overlap, above, left):
-    """Copies the part of a block (side, side, 3) below and right of the cuts through its overlaps onto the target.
-
-    Cuts are paths of least difference; block and target are blended over a width of 3 px across them.
-    """
+    """Copies a block (side, side, 3) below and right of the cuts of least difference to the target; blends 3 px."""
     side = target.shape[0]
     upper, west, cost = np.full(side, -2.0), np.full(side, -2.0), np.empty((side, overlap))
     if above:

@@ -120,10 +120,8 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
 
 @kernel(allocates=False)
 def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
-    """Returns the least t in [start, end] where the ray meets the floor of a cell; inf if none, NaN if a corner is NaN.
-
-    The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell.
-    """
+    """Returns the least t in [start, end] where a ray meets the floor of a cell; else inf, NaN if a corner is NaN."""
+    # The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell.
     h00, h01, h10, h11 = height[r, c], height[r, c + 1], height[r + 1, c], height[r + 1, c + 1]
     top = max(max(h00, h01), max(h10, h11))
     if np.isnan(h00 + h01 + h10 + h11):
@@ -156,10 +154,7 @@ def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
 
 
 def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Returns the triangles (n, 3) between the centres of valid raster cells, counter-clockwise from above.
-
-    They are indices of the row-major raster, whose row 0 is the northernmost.
-    """
+    """Returns triangles (n, 3), counter-clockwise from above: indices of valid cells, row by row from the north."""
     cells = np.arange(valid.size).reshape(valid.shape)
     triangles = grid_triangles(cells[::-1])
     return triangles[valid.reshape(-1)[triangles].all(axis=1)]

@@ -74,10 +74,7 @@ def sum_of_pixels(typingctx, image, start, stride, weights, at):
 
 @intrinsic
 def sum_of_texels(typingctx, texels, start, stride, weights):
-    """Returns the weighted sums (R, G, B) of 2 x 2 texels of uint8 colours (3 n,); no bounds are checked.
-
-    `start` is the index of the first value, `stride` that from row to row; the tuple `weights` runs row by row.
-    """
+    """Returns weighted sums (R, G, B) of 2 x 2 texels of uint8 colours (3 n,), row by row; no bounds are checked."""
     result, pair = types.UniTuple(types.float32, _BANDS), ir.VectorType(_NUMBER, 2 * _BANDS)
 
     def emit(context, builder, sig, args):

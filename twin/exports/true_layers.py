@@ -129,10 +129,8 @@ def _truth(
     world_from_camera: Array,
     compared: tuple[Image, bool | None],
 ) -> FrameTruth:
-    """Returns the layers of one frame; the caller replaces `flow_px` and `clean`, which are not computed here.
-
-    `view` is the left image, rendered again; `compared` the recorded left image, and `FrameTruth.identical`.
-    """
+    """Returns the layers of one frame, without `flow_px` and `clean`, which the caller replaces."""
+    # `view` is the left image, rendered again; `compared` the recorded one, and `FrameTruth.identical`
     recorded, identical = compared
     normals = floor_normals(mission.rendered_terrain, view.depth, world_from_camera, mission.rig)
     labels = np.zeros(view.depth.shape, np.uint16)
@@ -150,11 +148,8 @@ def _truth(
 
 
 def _difference(recorded: Image, noise_free: Image) -> float:
-    """Returns the RMS of the recorded image minus a factor times the image rendered again [grey levels].
-
-    Only values below full scale in both images count; 0 without any. The factor, which makes the RMS smallest, stands
-    for the delay of auto-exposure, which the image rendered again lacks.
-    """
+    """Returns the RMS of an image minus a factor times its rendering [grey levels], below full scale in both, or 0."""
+    # The factor, which makes it smallest, stands for the delay of auto-exposure, which the rendering lacks.
     below = (recorded < 255) & (noise_free < 255)
     seen, rendered = recorded[below].astype(np.float64), noise_free[below].astype(np.float64)
     if not len(seen):

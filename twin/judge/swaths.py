@@ -177,11 +177,8 @@ def image_pairs(poses: KeyframePoses, both_ways: bool = False) -> tuple[ImagePai
 
 
 def _across_pairs(poses: KeyframePoses) -> ImagePairs:
-    """Returns pairs of a keyframe and a hypothetical image abreast of it on the next swath: sidelap.
-
-    It has the pose of the nearest keyframe of the next swath, shifted along the direction of travel until the two are
-    abreast: otherwise the overlap would depend on where the keyframes of the two swaths happen to lie.
-    """
+    """Returns pairs of a keyframe and an image with the pose of the next swath's nearest keyframe, moved abreast."""
+    # not the keyframes themselves, as the sidelap would depend on where they happen to lie
     pairs = [_nearest_in_next(poses, swath) for swath in range(int(poses.swath.max(initial=-1)))]
     first, second = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0), np.int64)
     abreast, travel = poses.world_from_camera[second], poses.travel[first]

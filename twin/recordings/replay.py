@@ -126,10 +126,7 @@ def _replay(
 def _checkpoints(
     opened: OpenedDataset, options: ReplayOptions, description: str, out: Path, interval_s: float | None
 ) -> Checkpoints:
-    """Returns the checkpoints of a replay, which belong to its data set, its files, its options and this program.
-
-    Of images in files of their own, only names and times are compared.
-    """
+    """Returns the checkpoints of a replay of this data set, files, options and program (of images, names and times)."""
     frames = [(images.time_s, images.left.name, images.right and images.right.name) for images in opened.dataset.images]
     named = repr((description, replace(options, settings=None), frames)).encode()
     folder, given = opened.dataset.folder, (options.calibration, options.truth, options.true_map)

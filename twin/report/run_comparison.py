@@ -65,11 +65,7 @@ QUANTITIES = (
 
 
 class Cell(NamedTuple):
-    """Value of one run in the table, and its difference from that of the first run; None if it is missing.
-
-    `change` is the difference as text ("+1.2 mm (+10 %)", "same"), `level` "good" or "bad" against the first run, or
-    "".
-    """
+    """Value of one run in the table, its difference from the first as text, and "good", "bad" or "" for it."""
 
     value: float | None
     text: str

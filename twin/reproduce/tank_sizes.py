@@ -135,10 +135,8 @@ def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
 
 
 def _rise(at: Array, above: Array) -> float:
-    """Returns the place farthest from 0 at which heights (n,) above the level, on one side of 0, become positive [m].
-
-    It is interpolated linearly; NaN if the profile does not rise, or is above the level at its end.
-    """
+    """Returns the place farthest from 0 at which heights (n,) above a level turn positive [m], interpolated; or NaN."""
+    # NaN if the profile does not rise, or is above the level at its end
     order = np.argsort(-np.abs(at))
     at, above = at[order], above[order]
     higher = np.flatnonzero(above > 0)

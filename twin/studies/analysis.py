@@ -25,7 +25,7 @@ from twin.studies.answers import (
     range_text,
     regress,
 )
-from twin.studies.passing_map import PassingMap, passing_map
+from twin.studies.monotone import PassingMap, passing_map
 from twin.studies.statistics import UNDEFINED, Array, Interval, Proportion, SobolIndex
 from twin.studies.study_file import FIDELITY, Study
 

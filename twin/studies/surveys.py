@@ -84,10 +84,7 @@ class Survey(NamedTuple):
 
 
 class SampleSource(Source):
-    """Source of a sample's scenario: locates an error in it at the line of the study file that sets the faulty key.
-
-    An error in another key is located at the line of the key `scenario`.
-    """
+    """Source of a sample's scenario: errors are at the line of the study file that sets the key, else of `scenario`."""
 
     sample: int
     given: dict[str, str]  #: for each scenario key, its dotted name in the study file

@@ -19,7 +19,7 @@ from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import CONTROLLERS
 from twin.plugin.protocols import Adaptation, ControllerSetup, Situation
 from twin.simulate.autopilot import allocation_without, nominal_controller, thruster_lag_s
-from twin.simulate.fin_control import fin_autopilot
+from twin.simulate.fin_autopilot import fin_autopilot
 from twin.simulate.parameters import moves_along_all_axes
 from twin.world.computer import frames_of_latency
 from twin.world.mission import Mission

@@ -218,10 +218,8 @@ def _blocks(solid, start, to, from_floor):
 
 @kernel(error_model="numpy")
 def _interpolate(hidden, stride, depth, lit):
-    """Adds the hidden share of tested pixels to all pixels, as weighted means of the four around each.
-
-    Weights are those of bilinear interpolation, times nearness in depth; those in the same light or shadow count most.
-    """
+    """Adds the hidden share of tested pixels to all: weighted means of the four around each."""
+    # bilinear weights times nearness in depth; those in the same light or shadow count most
     rows, cols = hidden.shape
     height, width = depth.shape
     for r in range(rows - 1):

@@ -113,11 +113,9 @@ def shade(
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, range_m, normal):
-    """Computes range (W,) and normals (3, W) of the facets in a row of pixels, in the axes of the camera, upwards.
-
-    A pixel that shows several facets gets the mean of their normals at `SAMPLES`, on the plane of the central facet:
-    the light of a matt facet is proportional to a component of its normal.
-    """
+    """Computes range (W,) and upward normals (3, W) in camera axes, in a row of pixels; of several facets, the mean."""
+    # at `SAMPLES`, on the plane of the central facet: the light of a matt facet is proportional to a component of its
+    # normal
     normals, origin, grid, turn = facets
     zero, one, half, far = np.float32(0), np.float32(1), np.float32(0.5), np.float32(FAR_M)
     centre, flat, n_samples = half * np.float32(here.size - 1), normals.reshape(-1), SAMPLES.shape[0]
@@ -366,10 +364,8 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
-    """Fills row 1 of `daylight` (3, W) with row 0 times the cosine (at least 0) to the sun, row 2 with the depth [m].
-
-    Row 0 is the daylight relative to its mean (`_sample_caustics`). The normals of pixels without floor become 0.
-    """
+    """Fills row 1 of `daylight` (3, W) with row 0 times the cosine to the sun (least 0), row 2 with the depth [m]."""
+    # Row 0 is relative to the mean (`_sample_caustics`); the normals of pixels without floor become 0.
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for u in range(here.size):
         there = here[u] < far

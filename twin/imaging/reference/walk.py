@@ -70,10 +70,8 @@ def towards(lamp, point):
 
 @kernel
 def straight(scene, kind, point, axis, before, density, step_m):
-    """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
-
-    If the direction from `before` was sampled with a `density` [1/sr] above 0, it is weighted by `share_of_walk`.
-    """
+    """Returns the unscattered light of all lamps at a vertex, times its `response` [cd/m2]."""
+    # weighted by `share_of_walk` if the direction from `before` was sampled with a `density` [1/sr] above 0
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
         lamp = scene.lamps[k]
