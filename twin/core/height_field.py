@@ -210,11 +210,8 @@ def _overlaps(field, first, second, camera, directions, cell):
 
 @kernel(allocates=False)
 def _share_seen(field, pose, camera, cell, x, y, z, depth):
-    """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
-
-    `camera` is fx, fy, cx, cy, width and height, `cell` the size of a cell [px]; (x, y, z) is the floor point at its
-    centre and `depth` its depth in the first camera [m].
-    """
+    """Returns the share (0 to 1) of a cell [px] of the first image, at (x, y, z), that the second camera sees."""
+    # `camera` is fx, fy, cx, cy, width and height; `depth` is that of the centre in the first camera [m]
     fx, fy, cx, cy, width, height = camera
     dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
     depth2 = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz

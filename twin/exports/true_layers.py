@@ -75,10 +75,7 @@ def true_layers(
 
 
 def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
-    """Returns the true poses (n, 4, 4) of the left camera and velocities (n, 6) of the body, at frames 0 to n - 1.
-
-    The velocities are [angular, linear] in body axes [rad/s, m/s]. The file must have the frame with the number `last`.
-    """
+    """Returns true poses (n, 4, 4) of the left camera, body velocities (n, 6) [rad/s, m/s]; frames 0 to n > `last`."""
     with reading(file, "", "an undamaged file, written by `twin run`"):
         if not is_zipfile(file):
             raise ValueError("not an archive of NumPy")

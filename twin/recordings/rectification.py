@@ -82,12 +82,9 @@ def rectification(calibration: StereoCalibration, frame_rate_hz: float, fov_deg:
 
 
 def _wide_matrix(calibration: StereoCalibration, turns: tuple[Array, Array], fov_deg: float | None) -> Array:
-    """Returns the common camera matrix (3, 3) of lenses of any model; not finite if the views do not overlap.
-
-    By default, the focal length keeps `_KEPT` of the resolution at the centre (an image of the same size that holds all
-    of a wide field is coarse there), or more if the rectified images then lie in the recorded ones. `turns` are
-    rectified_from_recorded (3, 3) of both cameras.
-    """
+    """Returns the common camera matrix (3, 3) of any lenses (`turns`); not finite if the views do not overlap."""
+    # By default, the focal length keeps `_KEPT` of the resolution at the centre (an image of the same size that holds
+    # all of a wide field is coarse there), or more if the rectified images then lie in the recorded ones.
     cameras, (width_px, height_px) = (calibration.left, calibration.right), calibration.left.size_px or (0, 0)
     principal = np.mean([camera.matrix[:2, 2] for camera in cameras], axis=0)
     ahead = np.mean([turn[:2, 2] / turn[2, 2] for turn in turns], axis=0)  # the optical axes in rectified axes

@@ -155,11 +155,8 @@ def _estimate_in_stage(
 
 
 def _setup(opened: OpenedDataset, options: ReplayOptions, settings: EstimatorSettings) -> tuple[EstimatorSetup, Start]:
-    """Returns the rectified rig, the start and the noise of the readings, and the uncertainty of the start.
-
-    The start is that of the options; without one, that from the readings; without either, the camera above the floor
-    plane of the first pair.
-    """
+    """Returns rectified rig, start, noise of the readings, and uncertainty of the start."""
+    # start: of the options, else from the readings, else above the floor plane of the first pair
     rig, over_plane, aiding = opened.frames.rectification.rig, opened.plane.world_from_camera, opened.aiding
     start, noise = Start(over_plane if options.start is None else options.start), SensorNoise()
     if aiding is not None:

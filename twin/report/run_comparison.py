@@ -253,13 +253,9 @@ def _compared(quantity: ComparedQuantity, value: float | None, first: float | No
     level = "" if better is None else "good" if better else "bad"
     change = f"{'+' if difference > 0 else '-'}{quantity.text(abs(difference))}"
     if quantity.text is not percent and first > 0:
-        change += f" ({_relative(value / first)})"
+        factor = value / first
+        change += f" ({100 * (factor - 1):+.0f} %)" if factor < 3 else f" ({ratio(factor)})"
     return Cell(value, text, difference, change, level)
-
-
-def _relative(factor: float) -> str:
-    """Returns the ratio of two values as text: as a change in percent, e.g. "+10 %", below 3, otherwise as a factor."""
-    return f"{100 * (factor - 1):+.0f} %" if factor < 3 else ratio(factor)
 
 
 def _json(value: Any) -> str:

@@ -209,10 +209,8 @@ class StudyAnalysis:
 
     @cached_property
     def sobol(self) -> dict[str, dict[str, SobolIndex]]:
-        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes.
-
-        A metric is left out if it is constant, or if a survey of the design is not complete or has no value of it.
-        """
+        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes."""
+        # without metrics that are constant, or of which a survey of the design has no value
         sampling, keys = self.study.sampling, self.study.axes(listed=False)
         axes = [name if isinstance(name, str) else " + ".join(name) for name in keys]
         usable = sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1

@@ -36,10 +36,7 @@ class Answer(NamedTuple):
 
 
 class KeyLimit(NamedTuple):
-    """Value of a key at which the pass probability crosses the required one, with its 95 % confidence interval.
-
-    A number is infinite if it lies beyond the flown values.
-    """
+    """Value where the pass probability crosses the required one, and 95 % interval; infinite beyond flown values."""
 
     value: float  #: NaN if it depends on the unknown results
     low: float
@@ -153,10 +150,8 @@ def answers_of_ranges(regression: KeyRegression) -> list[Answer]:
 
 
 def limit_of_key(regression: KeyRegression, answers: list[Answer]) -> KeyLimit | None:
-    """Returns the limit of a key, given its answers; None unless the pass probability only rises, or falls, with it.
-
-    The interval extends from the end of the range that passes to that of the range that fails.
-    """
+    """Returns the limit of a key, given its answers; None unless the pass probability only rises, or falls, with it."""
+    # The interval extends from the end of the range that passes to that of the range that fails.
     if [len(pieces) for pieces in regression.worst] != [1]:
         return None
     curves = [pieces[0][1] for pieces in (regression.worst[0], regression.best[0])]

@@ -27,10 +27,7 @@ class Sample(NamedTuple):
 
 
 def samples(study: Study) -> Iterator[Sample]:
-    """Yields the samples of a study: each design point combined with every cell of the grids.
-
-    With the methods "random" and "sobol", the first samples stay the same if the number of samples is increased.
-    """
+    """Yields each design point with every cell of the grids; more samples keep the first ("random", "sobol")."""
     sampled, listed, plan = study.axes(listed=False), study.axes(listed=True), study.sampling
     points = design_points(plan.method, plan.samples or 1, len(sampled), plan.seed)
     columns = [law.quantiles(points[:, k]) for k, law in enumerate(sampled.values())]
@@ -102,10 +99,7 @@ class SampleSource(Source):
 
 
 def surveys(study: Study, folder: Path, without: Container[int] = (), shuffled: bool = False) -> Iterator[Survey]:
-    """Yields every survey of the study, sample by sample; raises ScenarioError if that of a sample is not valid.
-
-    If `shuffled`, the samples come in random order, so that the first of them represent all.
-    """
+    """Yields every survey, by sample, or `shuffled` (the first represent all); ScenarioError if one is not valid."""
     base, planned = read_tree(study.scenario_file), samples(study)
     if shuffled:
         in_order = list(planned)

@@ -256,10 +256,7 @@ class Tuning:
         self.start = self._verification(self.confirmation.evaluate(START, values), 0, _START_SURVEYS)
 
     def _verify(self, plan: Candidate, search_round: int) -> None:
-        """Flies rendered surveys of a plan until they show the required pass probability, or cannot show it any more.
-
-        What a search that ends before has flown counts as well.
-        """
+        """Flies rendered surveys of a plan until they show the pass probability or cannot; also of an ended one."""
         found, count = self._verification(plan, search_round, 0), 0
         self._announce(plan, found)
         while (further := found.next_surveys()) > count:
