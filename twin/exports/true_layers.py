@@ -169,11 +169,8 @@ def _camera_in_clear_water(mission: Mission, world: RenderedWorld) -> StereoCame
 def floor_normals(
     terrain: Heights, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
 ) -> NDArray[np.float32]:
-    """Returns the unit normals (H, W, 3) of the floor in the axes of the camera; zero where there is no floor.
-
-    A point of the floor lies in the south-eastern or the north-western triangle of its cell of the height grid.
-    `depth_m` (H, W) is inf where there is no floor.
-    """
+    """Returns the unit normals (H, W, 3) of the floor in the axes of the camera; 0 where `depth_m` (H, W) is inf."""
+    # of the south-eastern or the north-western triangle of the cell of the height grid
     known = np.isfinite(depth_m)
     points = geometry.transform(world_from_camera, _points(np.where(known, depth_m, 1.0), rig).reshape(-1, 3))
     grid = (points[:, :2] - [terrain.west_m, terrain.south_m]) / terrain.spacing_m

@@ -282,11 +282,7 @@ def _height_at(true: TrueMap, x: Array, y: Array) -> Array:
 
 
 def recorded_map_metrics(elevation: ElevationMap, heights: NDArray[np.float32]) -> dict[str, float | None]:
-    """Returns `map.*` of metrics.json for a map and its true heights (rows, cols) (`true_heights`).
-
-    Errors are those of all cells that have both. Metrics that need more than heights, completeness among them, are
-    None.
-    """
+    """Returns `map.*` of metrics.json over the cells (rows, cols) with `true_heights`; None if it needs more."""
     cells = np.isfinite(heights)
     return map_metrics(elevation, truth_without_flight(heights, cells, np.zeros_like(cells))) | dict.fromkeys(_UNKNOWN)
 

@@ -76,11 +76,8 @@ def is_turning(yaw: Array) -> NDArray[np.bool_]:
 
 
 def leg_numbers(reference: Array) -> NDArray[np.int64]:
-    """Returns the number (n,) of the leg of each frame, from 0; -1 on the short segments between legs.
-
-    Legs are parallel to the first step between the reference positions (n, 3). A leg ends where the direction of travel
-    reverses or a short segment begins.
-    """
+    """Returns the leg (n,) of each frame, from 0, or -1 between legs, from reference positions (n, 3)."""
+    # Legs are parallel to the first step; one ends where the direction of travel reverses or a short segment begins.
     direction = travel_direction(reference)
     cosine = direction @ direction[0] if len(direction) else np.zeros(0)
     on_leg = np.where(np.abs(cosine) > ON_LEG_COSINE, np.sign(cosine), 0.0)

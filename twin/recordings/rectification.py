@@ -121,11 +121,9 @@ def _field_deg(camera: RecordedCamera) -> float:
 
 
 def is_rectified(calibration: StereoCalibration) -> bool:
-    """Returns whether the recorded images are a rectified pair, but for a shift of the right image along its rows.
-
-    Such a pair has no distortion, parallel axes, a baseline along the image rows, and equal focal lengths and rows of
-    the principal points. Their columns may differ, as in the Middlebury data sets.
-    """
+    """Returns whether the recorded images are rectified, but for a shift of the right one along its rows."""
+    # no distortion, parallel axes, a baseline along the rows, equal focal lengths and rows of the principal points;
+    # their columns may differ, as in the Middlebury data sets
     left, right = calibration.left, calibration.right
     offset = calibration.right_from_left[:3, 3]
     parallel = np.linalg.norm(geometry.so3_log(calibration.right_from_left[:3, :3])) < _PARALLEL_RAD

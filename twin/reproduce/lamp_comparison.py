@@ -57,10 +57,7 @@ QUICK_LAMPS: Selection = (("IB", "III"), ("leds",), (2.0,), PIXELS[:2])
 
 
 def lamp_cells(selection: Selection = ALL_LAMPS, walks: int = WALKS, phase: str = "sea") -> Iterable[LightCell]:
-    """Yields the cells of a selection: conditions, with the light of a pixel by the model and by the reference.
-
-    A cell has at most `walks` pairs of random walks; `phase` is a value of `water.phase_function`.
-    """
+    """Yields cells of at most `walks` pairs of walks: a pixel by model and reference; `phase` of the scenario."""
     waters, arrangements, heights_m, pixels = selection
     for water, lamps in product(waters, arrangements):
         settings = f"water.jerlov={water}", f"water.phase_function={phase}", "sun.illuminance_lx=0"

@@ -136,11 +136,9 @@ def _place(nodes, value):
 
 
 def gust_series(current: CurrentConfig, rng: np.random.Generator | None) -> Array:
-    """Returns velocities (n, 3) of the gusts [m/s] every `GUST_INTERVAL_S`, periodic; (0, 3) without gusts.
-
-    The covariance of the values is exact: the circulant matrix of the covariances of the period has the eigenvalues
-    with which white noise is weighted (Davies & Harte 1987, Biometrika 74, 95).
-    """
+    """Returns velocities (n, 3) of the gusts [m/s] every `GUST_INTERVAL_S`, periodic; (0, 3) without gusts."""
+    # The covariance of the values is exact: the circulant matrix of the covariances of the period has the eigenvalues
+    # with which white noise is weighted (Davies & Harte 1987, Biometrika 74, 95).
     if rng is None or current.gust_mps == 0:
         return np.zeros((0, 3))
     vertical = current.gust_vertical_mps

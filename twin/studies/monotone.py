@@ -53,11 +53,9 @@ class FallingCurve(NamedTuple):
         return float(np.sum(xlogy(self.passes, fraction) + xlogy(self.n - self.passes, 1 - fraction)))
 
     def shown(self, required: float) -> tuple[int, int]:
-        """Returns the number of values, from the first, shown to reach a probability, and the first shown to miss it.
-
-        Both tests at a value use all surveys on the side where the probability is closer to the required one, so that
-        a value next to one that is shown, on the far side of the limit, is shown as well.
-        """
+        """Returns the number of values shown to reach a probability, and the first shown to miss it."""
+        # Both tests at a value use all surveys on the side where the probability is closer to the required one, so that
+        # a value next to one that is shown, on the far side of the limit, is shown as well.
         indices, critical = range(len(self.values)), CRITICAL * self.design_effect
 
         def differs(k: int, is_beyond: bool) -> bool:
@@ -145,11 +143,9 @@ def passing_map(
 
 
 def isotonic_table(target: Array, weights: Array, sweeps: int = _SWEEPS) -> Array:
-    """Returns the least squares fit (..., a, b) of a target that falls along both of the last two axes.
-
-    By Dykstra and Robertson (1982, Ann. Stat. 10, 708): isotonic regression of the rows and of the columns in turn,
-    each without its own last correction; about 0.02 from its limit by default. The weights have the shape (a, b).
-    """
+    """Returns the least squares fit (..., a, b), falling along the last two axes, with weights (a, b)."""
+    # Dykstra and Robertson (1982, Ann. Stat. 10, 708): isotonic regression of the rows and of the columns in turn, each
+    # without its own last correction; about 0.02 from its limit by default.
     columns, estimate = np.zeros_like(target), target
     for _ in range(sweeps):
         start = target + columns

@@ -47,11 +47,8 @@ def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
 
 
 def design_points(method: SamplingMethod, n_points: int, n_axes: int, seed: int) -> Array:
-    """Returns points (n, n_axes) in the unit cube; n is n_points, with "saltelli" n_points (n_axes + 2).
-
-    Saltelli's design (2010, Comput. Phys. Commun. 181, 259) stacks blocks A, B and, for each axis, A with the column
-    of this axis from B.
-    """
+    """Returns points (n, n_axes) in the unit cube; n is n_points, with "saltelli" n_points (n_axes + 2)."""
+    # Saltelli's design (2010, Comput. Phys. Commun. 181, 259): blocks A, B and, for each axis, A with its column from B
     from scipy.stats import qmc  # the import takes a second, and workers do not need it
 
     rng = np.random.default_rng([seed, _DESIGN_STREAM])

@@ -184,11 +184,9 @@ def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
 
 
 def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
-    """Raises TwinError if the vehicle comes too close to an object on its planned path.
-
-    The highest corner of its bounding box must be at least `clearance_m` below the cameras where their horizontal
-    distance to the circle around this box is less than VEHICLE_REACH_M.
-    """
+    """Raises TwinError if the vehicle comes too close to an object on its planned path."""
+    # the highest corner of its bounding box, less than `clearance_m` below the cameras within VEHICLE_REACH_M of its
+    # circle
     path = plan.all_references().position if objects else np.empty((0, 3))
     for item in objects:
         disc, top_m = disc_of(item), item.corners_m()[:, 2].max()

@@ -107,11 +107,8 @@ def level_plan(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
 
 
 def for_slopes(request: SurveyRequest) -> SurveyRequest:
-    """Returns the request with the spacing that keeps the overlaps over slopes of `UNKNOWN_SLOPE`.
-
-    At the slope g, the floor that rises reaches 1 / (1 + g t) as far into an image as level floor, with t the tangent
-    of half the angle of view (`_leg_spacing`).
-    """
+    """Returns the request with the spacing that keeps the overlaps over slopes of `UNKNOWN_SLOPE`."""
+    # At the slope g, the floor that rises reaches 1 / (1 + g t) as far into an image as level floor (`_leg_spacing`).
     across, along = (1 / (1 + UNKNOWN_SLOPE * side / 2 / request.altitude_m) for side in request.footprint_m)
     return request._replace(across_scale=across, along_scale=along)
 

@@ -46,11 +46,8 @@ class _Mode(NamedTuple):
 
 
 def legendre_moments(phase: PhaseTable, orders: int) -> Array:
-    """Returns the moments chi_l = 2 pi integral p P_l dmu of a phase function p for l = 0 to `orders`.
-
-    P_l is the Legendre polynomial of degree l, and mu the cosine of the scattering angle. The integral is computed by
-    the midpoint rule over the cells of the table.
-    """
+    """Returns the moments 2 pi integral p P_l dmu of a phase function p for l = 0 to `orders`, mu = cosine."""
+    # by the midpoint rule over the cells of the table
     share = np.diff(phase.cumulative)
     return np.array([share @ values for values in _polynomials(len(share), orders)])
 

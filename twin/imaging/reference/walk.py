@@ -340,10 +340,8 @@ def walk(scene, view, bin_edges_px, kind, point, axis, weight, rng, sums):
 
 @kernel
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
-    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2], ordered as `sums` of `walk`: the mean of pairs of walks.
-
-    One walk of a pair starts at the floor, one in the water; unscattered light on the floor point takes none.
-    """
+    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2], as `sums` of `walk`: the mean of pairs of walks."""
+    # One of a pair starts at the floor, one in the water; unscattered light on the floor point takes none.
     sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
     centre = (view[3, 0], view[3, 1], view[3, 2])
     a, b, f = view[4, 0], view[4, 1], view[4, 2]
