@@ -123,7 +123,7 @@ def _states_motion(message: Any) -> bool:
 
 
 def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str]:
-    """Returns the topics of type Imu that state an orientation, if any does with a covariance, those."""
+    """Returns the topics of type Imu that state an orientation, or those with a covariance if there are any."""
     # If none does: all or, if all messages mark their orientation as not measured, none, with a note.
     first = {name: list(_first(bag, name)) for name in topics}
     stated = [name for name in topics if any(_states_orientation(message) for message in first[name])]
