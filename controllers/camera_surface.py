@@ -95,10 +95,8 @@ def surface_above_floor(
 
 @kernel
 def _limit_slope(height_m, rise_u_m, rise_v_m):
-    """Returns heights raised as little as possible to limit slopes to 8 neighbours (chamfer sweeps, Borgefors 1986).
-
-    `rise_u_m` and `rise_v_m` are the greatest differences between neighbours along u (rows) and v (columns).
-    """
+    """Returns heights raised as little as possible to limit their steps (chamfer sweeps, Borgefors 1986)."""
+    # Greatest steps between neighbours along u (rows) and v (columns) are given.
     result = height_m.copy()
     rows, cols = result.shape
     for sweep in range(2):

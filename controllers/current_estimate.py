@@ -30,11 +30,9 @@ def unknown_current() -> CurrentEstimate:
 
 @kernel
 def update_current(flow, hull, pose, twist, period_s):
-    """Updates the estimate of the horizontal current with the measured velocity: a Kalman filter for each body axis.
-
-    Its states are the velocity v and the current c, with m v' = F - D(v - c) for the thrust F and the drag D of the
-    hull model; where the drag hardly depends on the current, the estimate of it changes little.
-    """
+    """Updates the estimate of the horizontal current by the measured velocity: a Kalman filter per body axis."""
+    # States: velocity v and current c, with m v' = F - D(v - c) for thrust F and drag D of the hull model; where the
+    # drag hardly depends on the current, the estimate of it changes little.
     current = rotate_to_body(pose, flow.current)
     change = np.zeros(3)
     for k in range(2):

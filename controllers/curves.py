@@ -70,11 +70,9 @@ def steady_line(start: Point, yaw: float, length_m: float, speed_mps: float) -> 
 
 
 def u_turn(start: Point, yaw: float, across_m: float, radius_m: float, speed_mps: float) -> Curve:
-    """Returns the turn by 180 deg that ends abreast of its start, `across_m` to the left (negative: to the right).
-
-    A half circle with ramps of its curvature (clothoids) where there is room for one of at least `radius_m`; else a
-    keyhole turn, which first bends away.
-    """
+    """Returns the turn by 180 deg that ends abreast of its start, `across_m` to the left (negative: to the right)."""
+    # a half circle with clothoid ramps where one of at least `radius_m` fits; else a keyhole turn, which first bends
+    # away
     bends = _bends_of_turn(abs(across_m), radius_m, speed_mps)
     return Curve(start, yaw, tuple((s, math.copysign(k, k * across_m)) for s, k in bends), speed_mps)
 

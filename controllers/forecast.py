@@ -67,10 +67,8 @@ class Clearance(NamedTuple):
 
 
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:
-    """Returns the clearance of a level path above the highest floor within the image footprints and between the swaths.
-
-    `height_at` returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain, a rectangle.
-    """
+    """Returns the clearance of a level path above the highest floor in the footprints and between the swaths."""
+    # `height_at` returns heights of the floor [m] at arrays x and y [m]; NaN outside the terrain, a rectangle.
     outline = plan.outline()[:, :2]
     path = np.column_stack(plan.area.to_legs(*outline.T))
     along_m, across_m = (side / 2 for side in plan.request.footprint_m[::-1])  # the image height lies along the legs

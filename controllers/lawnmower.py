@@ -154,11 +154,9 @@ def _track(request: SurveyRequest, area: SurveyArea, corners: list[tuple[float, 
 def _tracks_of_arcs(
     request: SurveyRequest, area: SurveyArea, corners: Sequence[list[tuple[float, float]]]
 ) -> list[tuple[PathSegment, ...]]:
-    """Returns the segments of tracks between their corners (u, v) [m], flown at constant speed.
-
-    A straight line before and after each leg gives the vehicle time to settle; the first line of a track begins where
-    the last track ends, after a whole number of frames.
-    """
+    """Returns the segments of tracks between their corners (u, v) [m], flown at constant speed."""
+    # Straight lines before and after a leg let the vehicle settle; a track begins where the last ends, after whole
+    # frames.
     speed, radius_m, run_m = request.speed_mps, request.turn_radius_m, _RUN_S * request.speed_mps
     ahead, astern, done_m, paths = area.heading, area.heading + math.pi, 0.0, list[tuple[PathSegment, ...]]()
     for (start, south), (turn, _), (_, north), (end, _), *following in corners:
@@ -188,11 +186,8 @@ def _line(request: SurveyRequest, start: Point, end: Point, yaw: float, is_leg: 
 def _cross_track(
     request: SurveyRequest, area: SurveyArea, legs: Sequence[_Leg], start: tuple[float, float], yaw: float
 ) -> tuple[Segment, ...]:
-    """Returns the segments of cross lines over the legs, from a start (u, v) [m], at one heading.
-
-    Each spans the legs that it crosses. Where two are joined, the one that ends first is extended. Before the first,
-    the camera rises to the height of the cross lines.
-    """
+    """Returns the segments of cross lines over the legs, from a start (u, v) [m], at one heading and their height."""
+    # Where two are joined, the one that ends first is extended.
     corners = [start]
     for k, u in enumerate(_cross_positions(legs, request.cross_lines)):
         crossed = [leg.v_m for leg in legs if leg.start_m <= u <= leg.end_m]

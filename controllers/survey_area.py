@@ -62,10 +62,7 @@ class SurveyArea:
         return (np.abs(u) <= self.size_m[0] / 2 + _EDGE_M) & (np.abs(v) <= self.size_m[1] / 2 + _EDGE_M)
 
     def outlines(self) -> list[Array]:
-        """Returns the closed outlines (n, 2) of the area and of its holes in the scene [m].
-
-        That of a disc has one point every 2 degrees.
-        """
+        """Returns the closed outlines (n, 2) of the area and its holes in the scene [m]; every 2 deg on a disc."""
         if self.shape == "disc":
             angle = np.linspace(0, 2 * np.pi, 181)
             rings = [self.size_m[0] / 2 * np.column_stack([np.cos(angle), np.sin(angle)])]

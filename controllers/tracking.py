@@ -109,10 +109,7 @@ def control_thrusters(controller, pose, twist, position, velocity, acceleration,
 
 @kernel
 def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, integral, current):
-    """Returns the wrench (6,) [moment, force] in the body, and the pose error (6,) that is integrated.
-
-    The error is [rotation in the body, position in the world] [rad, m].
-    """
+    """Returns the wrench (6,) [moment, force] in the body, and the integrated error (6,) [body rad, world m]."""
     error = _pose_error(pose, position, yaw)
     velocity_body = rotate_to_body(pose, velocity)
     feedforward = rotate_to_body(pose, integral[3:] + acceleration)

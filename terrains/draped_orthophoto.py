@@ -88,10 +88,7 @@ def _read(
 
 
 def _brightest(source: rasterio.DatasetReader, bands: list[int]) -> int:
-    """Returns the greatest value of an orthophoto: that of the bits that the file states (NBITS), else of a sample.
-
-    In the sample it is the 99.9th percentile, since a defective pixel may have any value.
-    """
+    """Returns the greatest value by the stated bits (NBITS), else the 99.9th percentile of a sample (bad pixels)."""
     if bits := source.tags(bands[0], ns="IMAGE_STRUCTURE").get("NBITS"):
         return 2 ** int(bits) - 1
     shape = (len(bands), min(source.height, _MOST_SAMPLED), min(source.width, _MOST_SAMPLED))

@@ -57,10 +57,7 @@ def read_raster_heights(file: Path, height_spacing_m: float, driver: str = "GTif
 
 
 def _values(source: rasterio.DatasetReader, file: Path) -> tuple[NDArray[np.float64], list[str]]:
-    """Returns the values (rows, cols) of the heights with the scale and the offset of their band; NaN in holes.
-
-    Also returns the doubts of `check_no_undeclared_holes`.
-    """
+    """Returns the heights (rows, cols), scaled and offset as stated, NaN in holes; and the doubts about holes."""
     scale, offset = source.scales[0], source.offsets[0]
     if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
         problem = f"has the band scale {scale:g} and offset {offset:g}"
@@ -113,10 +110,7 @@ def _vertical_axis(source: rasterio.DatasetReader, horizontal: Part, vertical: P
 
 
 def _output_crs(crs: CRS | None, horizontal: Part, vertical: Part) -> str | None:
-    """Returns the CRS of the output rasters as WKT; None if the file has no horizontal CRS.
-
-    The vertical part is dropped if it has another unit than metres or is positive downwards.
-    """
+    """Returns the CRS of the output rasters as WKT, or None; the vertical part only if in metres and upwards."""
     if crs is None or horizontal is None:
         return None
     upward = vertical is None or vertical["coordinate_system"]["axis"][0]["direction"] == "up"
@@ -142,10 +136,7 @@ def _in_degrees(source: rasterio.DatasetReader) -> bool:
 
 
 def _checked_ground_scale(source: rasterio.DatasetReader, unit_m: float, file: Path) -> float | None:
-    """Returns the ground scale of a projected CRS (m on the ground / m in the CRS) at the centre; else None.
-
-    Raises TwinError if it is far from 1, e.g. in Web Mercator (EPSG:3857).
-    """
+    """Returns the ground scale of a projected CRS at the centre, or None; TwinError if far from 1 (EPSG:3857)."""
     if source.crs is None or not source.crs.is_projected:
         return None
     scale, longitude, latitude = _ground_scale(source, unit_m)
@@ -159,10 +150,7 @@ def _checked_ground_scale(source: rasterio.DatasetReader, unit_m: float, file: P
 
 
 def _ground_scale(source: rasterio.DatasetReader, unit_m: float) -> tuple[NDArray[np.float64], float, float]:
-    """Returns distances on the ellipsoid / distances in the CRS at the centre, along easting and northing (2,), or 1.
-
-    Also returns longitude and latitude of the centre [deg].
-    """
+    """Returns m on the ellipsoid / m in the CRS along easting and northing (2,), or 1; and lon, lat [deg]."""
     east, north = _centre(source)
     step = 100.0 / unit_m
     xs, ys = [east, east + step, east], [north, north, north + step]

@@ -40,9 +40,6 @@ def decoded(file: Path, field: str, allowed: str, flags: int) -> NDArray[np.gene
 
 
 def eight_bits(values: NDArray[np.uint16], brightest: int) -> NDArray[np.uint8]:
-    """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower 8, 10, 12 or 14 only.
-
-    White is the greatest value of the fewest bits that contain `brightest`.
-    """
+    """Returns an 8-bit image; white is the greatest value of the 8, 10, 12, 14 or 16 bits that hold `brightest`."""
     white = next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
     return np.clip(np.rint(values * (255.0 / white)), 0, 255).astype(np.uint8)

@@ -51,10 +51,8 @@ EDGE_M = 0.12  #: size of the largest lobes of the border between two materials 
 def paint(
     material: NDArray[np.uint8], tone: NDArray[np.uint8], texel_m: float, cover: str, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns the colours (rows, cols, 3) uint8 of a floor with the materials of `cover`, a key of COVERS.
-
-    Quarters of the levels `material` belong to its four materials, with transitions; `tone` (rows, cols) is pink noise.
-    """
+    """Returns the colours (rows, cols, 3) uint8 of a floor with the four materials of `cover`, a key of COVERS."""
+    # quarters of `material` belong to one each, with transitions; `tone` (rows, cols) is pink noise
     covers = COVERS[cover]
     bands = [np.array([c.dark, c.medium, c.bright]).T for c in covers]
     tones = np.linspace(0.0, 1.0, 256)

@@ -86,10 +86,8 @@ def _octaves(x, y, octaves, table, layer):
 
 @kernel
 def cells(x, y, table, layer):
-    """Returns the distances to the nearest two points of cellular noise, and the nearest's own number, 0 to 1.
-
-    Each square of the lattice contains one point, at a random place; distances are in lattice spacings.
-    """
+    """Returns the distances to the nearest two points of cellular noise [spacings], and the number of the nearest."""
+    # Each square of the lattice contains one point, at a random place.
     nearest, second, row, col = 9.0, 9.0, 0, 0
     i0, j0 = int(np.floor(x)) - 1, int(np.floor(y)) - 1
     for i in range(i0, i0 + 3):

@@ -21,11 +21,9 @@ MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
 
 
 def even_lighting(photo: Image) -> Image:
-    """Returns a photo (h, w, 3) of a floor without slow variations of its brightness, the mean of R, G and B.
-
-    It is divided by a polynomial of degree 2 in row and column, fitted to about LIGHTING_SAMPLES pixels, or by 5 % of
-    the mean where that is less. A black photo is returned unchanged.
-    """
+    """Returns a photo (h, w, 3) without slow variations of its brightness; a black photo unchanged."""
+    # divided by a polynomial of degree 2 in row and column, fitted to about LIGHTING_SAMPLES pixels of the mean of R, G
+    # and B, or by 5 % of the mean where that is less
     step = max(1, round(np.sqrt(photo.shape[0] * photo.shape[1] / LIGHTING_SAMPLES)))
     v, u = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in photo.shape[:2])
     grey = photo[::step, ::step].mean(axis=2, dtype=np.float32)
@@ -48,10 +46,9 @@ def _terms(v: NDArray[np.float32], u: NDArray[np.float32]) -> tuple[NDArray[np.f
 
 
 def quilt(photo: Image, shape: tuple[int, int], rng: np.random.Generator) -> Image:
-    """Returns a texture (rows, cols, 3) made of blocks of a photo (h, w, 3), with the scale of the photo.
+    """Returns a texture (rows, cols, 3) of blocks of a photo (h, w, 3) of its scale; a part of it if it fits.
 
-    A texture that fits into the photo is its upper left part. The photo has at least BLOCK_FRACTION * MIN_BLOCK_PX rows
-    and columns.
+    The photo has at least BLOCK_FRACTION * MIN_BLOCK_PX rows and columns.
     """
     rows, cols = shape
     if rows <= photo.shape[0] and cols <= photo.shape[1]:
@@ -97,10 +94,7 @@ def _squared(a, b):
 
 @kernel
 def _join(target, block, overlap, above, left):
-    """Copies the part of a block (side, side, 3) below and right of the cuts through its overlaps onto the target.
-
-    Cuts are paths of least difference; block and target are blended over a width of 3 px across them.
-    """
+    """Copies a block (side, side, 3) below and right of the cuts of least difference to the target; blends 3 px."""
     side = target.shape[0]
     upper, west, cost = np.full(side, -2.0), np.full(side, -2.0), np.empty((side, overlap))
     if above:

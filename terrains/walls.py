@@ -48,11 +48,9 @@ def walls_of(
 def wall_weights(
     height_m: NDArray[np.float32], spacing_m: float, draped: Mask | None = None
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]] | None:
-    """Returns `number` and `weights` of `Walls` for heights (ny, nx); None if no cell is steep.
-
-    The normal at a corner is the mean over adjacent cells with normals near that of the cell itself (CREASE_COSINE), so
-    that weights vary smoothly, except at edges. Cells that overlap `draped` have no weights.
-    """
+    """Returns `number` and `weights` of `Walls` for heights (ny, nx), 0 under `draped`; None if no cell is steep."""
+    # The normal at a corner is the mean over adjacent cells with normals near that of the cell itself (CREASE_COSINE),
+    # so that weights vary smoothly, except at edges.
     normals = _cell_normals(height_m, spacing_m)
     steep = normals[..., 2] <= STEEP_COSINE
     if not steep.any():

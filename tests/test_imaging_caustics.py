@@ -10,12 +10,21 @@ from twin.core import geometry
 from twin.errors import TwinError
 from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light import caustics as caustics_module
-from twin.imaging.light.caustics import CELLS, TILE_DEPTHS, Caustics, displacement, scattering_blur
+from twin.imaging.light.caustics import (
+    CELLS,
+    GRAVITY_MPS2,
+    TILE_DEPTHS,
+    Caustics,
+    curvature_spectrum,
+    directionality,
+    displacement,
+    scattering_blur,
+    slope_variance,
+)
 from twin.imaging.light.illumination import Daylight, Illumination, daylight_at, illumination_of
 from twin.imaging.light.phase_function import BandWater, Scatterer, table_of
 from twin.imaging.light.sun_sky import SunSky, direction_to_sun
 from twin.imaging.light.water import Medium, medium
-from twin.imaging.light.waves import GRAVITY_MPS2, curvature_spectrum, directionality, slope_variance
 from twin.scenario.model import SEA_WATER_INDEX, Scenario, SunConfig, WaterConfig
 
 CLEAR = medium(WaterConfig(jerlov="clear"))

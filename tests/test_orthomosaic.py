@@ -23,8 +23,7 @@ from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPo
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.optics import Optics
 from twin.imaging.restoration import Restoration, estimated_floor, linear_signal
-from twin.judge.colour_difference import ciede2000, lab_of
-from twin.judge.orthomosaic_errors import OrthomosaicJudge
+from twin.judge.orthomosaic_errors import OrthomosaicJudge, ciede2000, lab_of
 from twin.report.run_folder import read_mosaic
 from twin.scenario.model import LampConfig, MapConfig, Scenario, SensorConfig, WaterConfig
 from twin.world.top_surface import true_albedo

@@ -6,8 +6,7 @@ from scipy import optimize, stats
 from scipy.special import expit, logit
 
 from twin.studies.answers import PassRecord, answers_of_ranges, limit_of_key, regress
-from twin.studies.monotone import falling_curve
-from twin.studies.passing_map import isotonic_table, passing_map
+from twin.studies.monotone import falling_curve, isotonic_table, passing_map
 from twin.studies.statistics import clustered_proportion, exact_interval, trials_to_show
 
 

@@ -15,13 +15,14 @@ from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario, TerrainConfig
 from twin.terrains import Terrain
 from twin.terrains.ground_cover import COVERS
-from twin.terrains.objects import built_models, mesh_file, scattering
+from twin.terrains.objects import mesh_file, scattering
 from twin.terrains.objects.coloured_mesh import Mesh, with_colours
 from twin.terrains.objects.detail import levels_of
 from twin.terrains.objects.floor_mesh import tiles_of
 from twin.terrains.objects.mesh_file import face_count
 from twin.terrains.objects.placed_object import model_of
 from twin.terrains.objects.shapes import SHAPES, build_shape
+from twin.world import objects
 from twin.world.objects import load_objects
 
 FIELD = "objects.0.mesh_file"
@@ -347,17 +348,17 @@ def untextured(mesh: Mesh) -> mesh_file.TexturedMesh:
 
 
 def test_a_model_read_from_disk_is_the_built_one_and_a_damaged_file_is_built_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(built_models, "cache_folder", lambda *_: tmp_path)
+    monkeypatch.setattr(objects, "cache_folder", lambda *_: tmp_path)
     seed = np.random.SeedSequence([3, 4])
     expected = model_of(build_shape("crate", None, np.random.default_rng(seed)))
     for damaged in (None, b"", b"no pickle"):
         if damaged is not None:
             next(tmp_path.glob("*.pickle")).write_bytes(damaged)
         for _ in range(2):  # built, then read
-            model = built_models.built_model("crate", None, seed)
+            model = objects.built_model("crate", None, seed)
             for level, of_built in zip(model.levels, expected.levels, strict=True):
                 np.testing.assert_array_equal(level.mesh.vertices_m, of_built.mesh.vertices_m)
                 assert level.mesh.vertices_m.flags.f_contiguous
     assert len(list(tmp_path.iterdir())) == 1
-    built_models.built_model("crate", (0.1, 0.2, 0.3), seed)
+    objects.built_model("crate", (0.1, 0.2, 0.3), seed)
     assert len(list(tmp_path.iterdir())) == 2

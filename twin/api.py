@@ -116,7 +116,7 @@ def vehicle(
         TwinError: the vehicle is kinematic, its plug-in fails, or the picture cannot be written.
     """
     from twin.app.outputs import output_file, writing
-    from twin.planning import vehicle_drawing, vehicle_limits
+    from twin.planning import drawing, vehicle_limits
     from twin.world.mission import prepare
 
     scenario = _scenario(scene, overrides, sections)
@@ -129,7 +129,7 @@ def vehicle(
         raise TwinError("vehicle", str(error), "a controller that flies it") from None
     if file is not None:
         with writing(file):
-            vehicle_drawing.draw(scenario.vehicle, limits, file)
+            drawing.draw_vehicle(scenario.vehicle, limits, file)
     return limits
 
 

@@ -70,10 +70,7 @@ def extent(mesh: Mesh) -> tuple[Array, Array]:
 
 
 def median_edge_m(mesh: Mesh) -> float:
-    """Returns the median length of the edges of the triangles [m].
-
-    Edges shorter than a millionth of the largest extent count only if all are; then the result is that millionth.
-    """
+    """Returns the median length of the edges [m] longer than a millionth of the largest extent; else that millionth."""
     corners = mesh.vertices_m[mesh.faces]
     lengths_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     shortest_m = 1e-6 * float(np.ptp(mesh.vertices_m, axis=0).max())

@@ -36,10 +36,7 @@ class FloorTiles(NamedTuple):
 
 
 def levelled(read: TexturedMesh, scale: float) -> TexturedMesh:
-    """Returns a mesh as read from a file in metres with its upper side up, centred at x = y = 0.
-
-    Triangles are turned over if the volume is negative, or if most of the area of an open sheet faces down.
-    """
+    """Returns a mesh [m] centred at x = y = 0; turned over if its volume is negative or most of a sheet faces down."""
     vertices, faces = read.mesh.vertices_m.astype(np.float64) * scale, read.mesh.faces
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     up_m2 = _upward_m2(vertices, faces)
@@ -148,10 +145,8 @@ def _tile(
 
 
 def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
-    """Returns (n, 3): texture coordinates of the vertices, from the upper left corner, and side of a texel there [m].
-
-    This is the root of the ratio of the areas of a triangle on the floor and in the texture, at a vertex the mean.
-    """
+    """Returns (n, 3): texture coordinates of the vertices, from the upper left, and side of a texel there [m]."""
+    # root of the ratio of the areas of a triangle on the floor and in the texture; the mean at a vertex
     mesh, n = whole.mesh, len(whole.mesh.vertices_m)
     corners, places = mesh.vertices_m[mesh.faces].astype(np.float64), whole.uv[mesh.faces].astype(np.float64)
     floor_m2 = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -166,10 +161,7 @@ def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
 
 
 def _colour_levels(whole: TexturedMesh) -> list[tuple[NDArray[np.uint8], float]]:
-    """Returns colours (n, 3) of the vertices, each with the side [m] of the cells over which they are averaged.
-
-    There are no others if every triangle has a texture.
-    """
+    """Returns colours (n, 3) of the vertices, each with its side of averaging [m]; one if all have a texture."""
     mesh = whole.mesh
     levels, cell_m = [(mesh.colours, 0.0)], np.inf if (whole.texture >= 0).all() else median_edge_m(mesh)
     while cell_m <= LARGEST_CELL_M:

@@ -121,11 +121,8 @@ def _loaded(file: Path, field: str) -> list[Any]:
 
 
 def _near_origin(parts: list[Any]) -> list[Any]:
-    """Returns trimesh meshes, moved together so that the centre of their bounding box is the origin if it is far off.
-
-    It is if one of its coordinates exceeds 8 times the largest side of the box. Georeferenced models have coordinates
-    of 1e5 to 1e7 m, which single precision rounds to steps of up to 1 m.
-    """
+    """Returns trimesh meshes, together centred at the origin if they are more than 8 of their sizes away."""
+    # Georeferenced models have coordinates of 1e5 to 1e7 m, which single precision rounds to steps of up to 1 m.
     corners = [np.asarray(part.vertices) for part in parts if len(part.vertices)]
     if not corners:
         return parts
@@ -153,10 +150,8 @@ def _coloured(part: Any, grey: Array, most_faces: int) -> Mesh:
 
 
 def _own_colours(part: Any) -> Any:
-    """Returns the colours of the vertices (n, 3) or of the glTF material (3,), 0 to 255; None if it has neither.
-
-    The factor of a material with a texture is not used: trimesh writes one of 0.4 that is not intended.
-    """
+    """Returns the colours of vertices (n, 3) or material (3,), 0 to 255, or None."""
+    # The factor of a textured material is not used: trimesh writes one of 0.4 that is not intended.
     if hasattr(part.visual, "vertex_colors") and part.visual.defined:
         return np.asarray(part.visual.vertex_colors)[:, :3]
     factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)

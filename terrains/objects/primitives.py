@@ -54,10 +54,7 @@ def quad_faces(a: Faces, b: Faces, c: Faces, d: Faces) -> Faces:
 
 
 def turned(profile: Array, n_sides: int) -> Surface:
-    """Returns a surface of revolution about z.
-
-    `profile` (k, 2) has positive radii, and heights, along a closed outline, counter-clockwise, radius to the right.
-    """
+    """Returns a surface of revolution about z of a closed outline (k, 2) of radii and heights, counter-clockwise."""
     angle = 2 * np.pi * np.arange(n_sides) / n_sides
     radius, height = profile[:, :1], profile[:, 1:]
     rings = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.repeat(height, n_sides, axis=1)], axis=-1)
@@ -89,10 +86,8 @@ def box(size: tuple[float, float, float], n: tuple[int, int, int]) -> Surface:
 
 
 def noise(points: Array, coarsest: float, octaves: int, rng: np.random.Generator, gain: float = 0.5) -> Array:
-    """Returns smooth random values (n,) at points (n, 3), with a standard deviation of about 1.
-
-    Each octave is a sum of plane waves; octave k has the wavelength coarsest / 2^k and the amplitude gain^k.
-    """
+    """Returns smooth random values (n,) at points (n, 3), standard deviation about 1: octaves k of gain^k."""
+    # Each octave is a sum of plane waves of the wavelength coarsest / 2^k.
     total, power = np.zeros(len(points)), 0.0
     for k in range(octaves):
         waves = rng.standard_normal((WAVES, 3))

@@ -88,11 +88,8 @@ class _Entry(NamedTuple):
         return np.array([1.0 if size_m is None else size_m / model.size_m for model in models]) * factor
 
     def at(self, model: ObjectModel, scale: float, position_m: tuple[float, float]) -> PlacedObject:
-        """Returns an object at a position (x, y) [m].
-
-        Without a given height it stands on the floor, sunk by a share of its height; without a heading, that is random.
-        An object that is not upright is tilted to the normal of the floor.
-        """
+        """Returns an object at a position (x, y) [m], sunk by a share of its height, upright or tilted to the floor."""
+        # without a given height it stands on the floor; without a heading, that is random
         (x, y), group, terrain = position_m, self.group, self.terrain
         heading, phase = self.rng.uniform(0, 2 * np.pi, 2)
         if group.heading_deg is not None:
@@ -142,11 +139,8 @@ class _Entry(NamedTuple):
         return slope < STEEP_DEG if self.group.on == "sand" else slope >= STEEP_DEG
 
     def _free_position(self, low: Array, high: Array, radius_m: float, around: Array) -> tuple[float, float] | None:
-        """Returns a random position (x, y) [m] between two corners where an object may stand; None if none is found.
-
-        It is at least `group.spacing_m` from the centres of the circles `around` (n, 3): x, y, radius [m], and the
-        circle of radius `radius_m` about it overlaps none of them.
-        """
+        """Returns a random position (x, y) [m] between two corners, free for a circle of `radius_m`; or None."""
+        # at least `group.spacing_m` from the centres `around` (n, 3): x, y, radius [m], none of which it overlaps
         if (low >= high).any():
             return None
         apart = np.maximum(around[:, 2] + radius_m, self.group.spacing_m)

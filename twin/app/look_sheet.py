@@ -90,13 +90,9 @@ def _light(
     linear: bool = True,
     percentile: float = SHOWN_PERCENTILE,
 ) -> Panel:
-    """Returns the colour panel of one light component (H, W, 3).
-
-    A component whose `percentile` lies between half and full scale of the image is displayed as bright as in the image.
-    Any other is scaled so that its `percentile` is white; the note of the panel then gives the scale factor, or for
-    gain 0 (not in the image) the value that is displayed as white. Where it is not positive, the panel is black. `gain`
-    is the image brightness (fraction of full scale) per unit of the component.
-    """
+    """Returns the colour panel of one light component (H, W, 3); black where its `percentile` is not positive."""
+    # A component whose `percentile` lies between half and full scale is shown as in the image. Any other is scaled so
+    # that it is white, by the factor in the note (for gain 0, not in the image: the value shown as white).
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0
     if top <= 0:
         return Panel(title, unit, layer, np.zeros(layer.shape), "none")

@@ -151,10 +151,7 @@ def file_hash(file: Path) -> str:
 
 
 def check_inputs(folder: Path, inputs: Iterable[Path]) -> None:
-    """Writes the hashes of input files to inputs.json or, if it exists, raises TwinError if a file has changed since.
-
-    Raises OSError if it cannot be written.
-    """
+    """Writes inputs.json, hashes of input files; if it exists, TwinError if one has changed. OSError if unwritable."""
     record = folder / "inputs.json"
     before = read_json(record, allowed=_WHOLE) if is_file(record) else {}
     now = {str(file): file_hash(file) for file in sorted(set(inputs))}

@@ -120,10 +120,8 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
 
 @kernel(allocates=False)
 def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
-    """Returns the least t in [start, end] where the ray meets the floor of a cell; inf if none, NaN if a corner is NaN.
-
-    The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell.
-    """
+    """Returns the least t in [start, end] where a ray meets the floor of a cell; else inf, NaN if a corner is NaN."""
+    # The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell.
     h00, h01, h10, h11 = height[r, c], height[r, c + 1], height[r + 1, c], height[r + 1, c + 1]
     top = max(max(h00, h01), max(h10, h11))
     if np.isnan(h00 + h01 + h10 + h11):
@@ -156,10 +154,7 @@ def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
 
 
 def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Returns the triangles (n, 3) between the centres of valid raster cells, counter-clockwise from above.
-
-    They are indices of the row-major raster, whose row 0 is the northernmost.
-    """
+    """Returns triangles (n, 3), counter-clockwise from above: indices of valid cells, row by row from the north."""
     cells = np.arange(valid.size).reshape(valid.shape)
     triangles = grid_triangles(cells[::-1])
     return triangles[valid.reshape(-1)[triangles].all(axis=1)]
@@ -215,11 +210,8 @@ def _overlaps(field, first, second, camera, directions, cell):
 
 @kernel(allocates=False)
 def _share_seen(field, pose, camera, cell, x, y, z, depth):
-    """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
-
-    `camera` is fx, fy, cx, cy, width and height, `cell` the size of a cell [px]; (x, y, z) is the floor point at its
-    centre and `depth` its depth in the first camera [m].
-    """
+    """Returns the share (0 to 1) of a cell [px] of the first image, at (x, y, z), that the second camera sees."""
+    # `camera` is fx, fy, cx, cy, width and height; `depth` is that of the centre in the first camera [m]
     fx, fy, cx, cy, width, height = camera
     dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
     depth2 = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz

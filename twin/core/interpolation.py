@@ -33,11 +33,8 @@ def catmull_rom_weights(t):
 
 @kernel(inline="always")
 def bicubic_with_gradient(image, x, y):
-    """Returns the value of an image at column x and row y, and its derivatives, by bicubic (Catmull-Rom) interpolation.
-
-    (x, y) must lie inside the image; samples beyond the border repeat the border pixel. If y is an integer, as in
-    rectified stereo, the derivative with respect to y is the central difference at the column floor(x).
-    """
+    """Returns an image and its derivatives at column x, row y inside it, by bicubic (Catmull-Rom) interpolation."""
+    # In a row of integer y, as in rectified stereo, d/dy is the central difference at the column floor(x).
     height, width = image.shape
     i, j = int(x), int(y)
     s, t = np.float32(x - i), np.float32(y - j)

@@ -55,11 +55,8 @@ def _fill_from(source, positions, out, first, end):
 
 @kernel
 def _round_row(row, out):
-    """Rounds values (3 w,) to integers from 0 to 255 and adds the remainder of each to the next pixel of its band.
-
-    If the remainders were dropped, shifts by a small part of a pixel would be lost: they change the integers of a
-    source image with little contrast by less than 1/2.
-    """
+    """Rounds values (3 w,) to 0 to 255, and adds the remainder of each to the next pixel of its band."""
+    # Without them, small shifts of an image with little contrast would be lost: they change integers by less than 1/2.
     half, least, most = np.float32(0.5), np.float32(0.0), np.float32(255.0)
     for band in range(3):
         remainder = np.float32(0.0)
@@ -165,12 +162,9 @@ def _filter_block(image, first, end):
 
 @kernel(fastmath={"contract"})
 def _filter_rows(wide, image, first, end):
-    """Fills rows of an image (H, 3 W) with the coefficients of rows that are mirrored by TAPS.
-
-    The two filters have the symmetric impulse response -6 p / (1 - p^2) p^|n|, summed up to |n| = `TAPS` and divided by
-    the sum of its values, so that even light stays; along rows, a convolution is faster than a recursion, which has to
-    wait for the previous pixel.
-    """
+    """Fills rows of an image (H, 3 W) with the coefficients of rows that are mirrored by TAPS."""
+    # The two filters have the impulse response -6 p / (1 - p^2) p^|n| to |n| = TAPS, divided by its sum, so that even
+    # light stays; along rows, a convolution is faster than a recursion, which waits for the previous pixel.
     pole = np.float32(POLE)
     sum_of_powers = 1.0
     for i in range(1, TAPS + 1):

@@ -9,10 +9,7 @@ _INITIAL_CAPACITY = 2**17
 
 
 class GrowingArray:
-    """Contiguous array of rows of one shape (omitted for scalars); its capacity doubles when it is full.
-
-    Pages of the initial capacity that are never written occupy no RAM.
-    """
+    """Contiguous rows of one shape (omitted for scalars); the capacity doubles when full, unused pages take no RAM."""
 
     def __init__(self, *shape: int, dtype: DTypeLike = float):
         self._buffer, self._n = np.empty((_INITIAL_CAPACITY, *shape), dtype), 0

@@ -38,11 +38,9 @@ _NUMBER, _INDEX = ir.FloatType(), ir.IntType(32)
 
 @intrinsic
 def sum_of_pixels(typingctx, image, start, stride, weights, at):
-    """Returns the weighted sums (R, G, B) of 4 x 4 pixels of a float32 image (H, 3 W); no bounds are checked.
-
-    `start` is the index of the top left value, `stride` that from row to row; column `at` of `weights` (8, n) holds the
-    weights of the columns (0 to 3) and of the rows (4 to 7).
-    """
+    """Returns weighted sums (R, G, B) of 4 x 4 pixels of a float32 image (H, 3 W) at `start`; no bounds are checked."""
+    # `stride` is that of rows; column `at` of `weights` (8, n) holds those of the columns (0 to 3) and of the rows (4
+    # to 7)
     result = types.UniTuple(types.float32, _BANDS)
     signature = result(image, types.int64, types.int64, weights, types.int64)
 
@@ -74,10 +72,7 @@ def sum_of_pixels(typingctx, image, start, stride, weights, at):
 
 @intrinsic
 def sum_of_texels(typingctx, texels, start, stride, weights):
-    """Returns the weighted sums (R, G, B) of 2 x 2 texels of uint8 colours (3 n,); no bounds are checked.
-
-    `start` is the index of the first value, `stride` that from row to row; the tuple `weights` runs row by row.
-    """
+    """Returns weighted sums (R, G, B) of 2 x 2 texels of uint8 colours (3 n,), row by row; no bounds are checked."""
     result, pair = types.UniTuple(types.float32, _BANDS), ir.VectorType(_NUMBER, 2 * _BANDS)
 
     def emit(context, builder, sig, args):

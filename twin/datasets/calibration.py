@@ -162,10 +162,7 @@ def checked(calibration: StereoCalibration) -> StereoCalibration:
 
 
 def rigid(pose: Array, key: str, file: Path) -> Array:
-    """Returns a pose (4, 4) with an orthonormal rotation; raises TwinError, naming `key`, for no rotation matrix.
-
-    The rounding of calibration files is allowed.
-    """
+    """Returns a pose (4, 4) with an orthonormal rotation, up to rounding; else TwinError, which names `key`."""
     deviation = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() if np.isfinite(pose).all() else np.inf
     deviation = max(deviation, np.abs(pose[3] - [0, 0, 0, 1]).max())
     if not (deviation < _ORTHONORMAL and np.linalg.det(pose[:3, :3]) > 0):

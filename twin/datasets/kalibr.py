@@ -24,10 +24,7 @@ _IRRELEVANT = (
 
 
 def read_camchain(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration of a camchain, by T_cn_cnm1 or, without it, by T_imu_cam of both cameras (OpenVINS).
-
-    Raises TwinError without cam1, or if a camera or a pose is wrong.
-    """
+    """Returns a camchain by T_cn_cnm1, else T_imu_cam of both (OpenVINS); TwinError without cam1, or if wrong."""
     if "cam1" not in tree:
         raise TwinError(str(file), "has one camera only, so it has no baseline", "cam0 and cam1 with T_cn_cnm1")
     refuse_unknown((key for key in tree if not re.fullmatch(r"cam\d", str(key))), file)

@@ -36,10 +36,8 @@ def read_cameras(root: Element, file: Path) -> StereoCalibration:
 
 
 def _camera(sensor: Element, file: Path) -> RecordedCamera:
-    """Returns a sensor by the frame model of the Metashape manual: p1 and p2 are p2 and p1 of OpenCV, b2 is the skew.
-
-    The corner of the first pixel is at (0, 0), and cx, cy count from the image centre. Other coefficients must be 0.
-    """
+    """Returns a sensor by the frame model of the manual: p1, p2 are p2, p1 of OpenCV, b2 the skew; others must be 0."""
+    # The corner of the first pixel is at (0, 0), and cx, cy count from the image centre.
     table, resolution = sensor.find("calibration[@class='adjusted'][@type='frame']"), sensor.find("resolution")
     if table is None or resolution is None:
         raise TwinError(str(file), "has a sensor without an adjusted calibration of type frame", "two frame cameras")

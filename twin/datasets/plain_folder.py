@@ -61,11 +61,8 @@ def _natural_order(name: str) -> list[tuple[int, int | str]]:
 
 
 def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
-    """Returns the times of the images [s], and notes on assumptions about them.
-
-    They are those in times.txt, otherwise those in the names: seconds with a decimal point, or an integer in a unit of
-    `_UNITS` since 1970. Without both, 1 frame per second is assumed.
-    """
+    """Returns the times of the images [s], from times.txt, else from their names, and notes on assumptions."""
+    # names: seconds with a decimal point, or an integer in one of `_UNITS` since 1970; else 1 frame per second
     if file.exists():
         times_s = read_table(file, 1)[:, 0].tolist()
         if len(times_s) != len(names):

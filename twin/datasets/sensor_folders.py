@@ -97,10 +97,7 @@ def _read_sigmas(file: Path, n: int) -> Array | None:
 
 
 def _read_imu(folder: Path, notes: list[str]) -> tuple[SensorSeries, Array, ImuErrorModel] | None:
-    """Returns readings (n, 6), pose in the body and errors of an IMU; None without one, or with a note on why.
-
-    By default the axes of the IMU are those of the body, and its biases are the usual ones.
-    """
+    """Returns readings (n, 6), pose in the body (default: its axes) and errors of an IMU; else None, with a note."""
     file, description = folder / "data.csv", folder / "sensor.yaml"
     if not file.exists():
         return None

@@ -63,10 +63,8 @@ def write_map(
 def write_elevations(
     path: Path, height_m: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
 ) -> None:
-    """Writes heights (rows, cols) [m] above z = 0, NaN where unknown: as float32, or as elevations in the datum.
-
-    Elevations are float64, because float32 would round those of a site deeper than about 1 km to steps of 0.1 mm.
-    """
+    """Writes heights (rows, cols) [m], NaN where unknown: as float32 above z = 0, or as elevations in the datum."""
+    # elevations are float64: float32 would round those of sites below about 1 km to steps of 0.1 mm
     if georeference is None:
         return write_layer(path, height_m, grid, description)
     elevations = height_m.astype(np.float64) + georeference.elevation_m

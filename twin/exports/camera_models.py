@@ -47,11 +47,8 @@ def _points(rig: StereoRig, altitude_m: float) -> Array:
 
 
 def _fitted(cameras: TrueCameras, side: int, points_m: Array, rig: StereoRig) -> tuple[RecordedCamera, Array, Array]:
-    """Returns the model fitted to one camera, its rotation (3, 3) camera_from_rendered, and the residuals (2 n,) [px].
-
-    The rotation of the left camera (`side` 0) is the identity: its axes are those of the true poses. Points (n, 3) in
-    the axes of the rendered camera without an image are left out. `rig` is the start of the fit.
-    """
+    """Returns the model fitted to one camera, its rotation (3, 3) camera_from_rendered, and residuals (2 n,) [px]."""
+    # the left one (`side` 0) is not turned, as in the true poses; points (n, 3) without an image are left out
     seen = cameras.project(points_m, side)
     known = np.isfinite(seen).all(axis=1)
     points_m, seen = points_m[known], seen[known]

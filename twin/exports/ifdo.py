@@ -98,10 +98,8 @@ def _item(place: Place | None, frame: RecordedFrame, image: Path, pose: Array) -
 
 
 def _position(place: Place | None, pose: Array) -> dict[str, Any]:
-    """Returns the fields of the position (in EPSG:4326) and the pose (4, 4) (in UTM on WGS 84) of a camera.
-
-    Without a place, iFDO has no field for either; both are then settings of the acquisition, in scene coordinates [m].
-    """
+    """Returns the fields of position (EPSG:4326) and pose (4, 4) (UTM, WGS 84) of a camera."""
+    # Without a place, iFDO has no field: both are settings of the acquisition, in scene coordinates [m].
     x, y, z = (float(value) for value in pose[:3, 3])
     if place is None:
         settings = {"local-position-meters": [x, y, z], "local-orientation-matrix": pose[:3, :3].tolist()}

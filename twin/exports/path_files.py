@@ -18,10 +18,7 @@ _SUBMARINE, _ARDUPILOT = 12, 3
 
 
 def write_qgc(path: PlannedPath, file: Path) -> None:
-    """Writes a mission of QGroundControl for ArduSub, whose altitudes are relative to the sea surface.
-
-    The zero of the elevations is taken to be the surface. Raises TwinError if a waypoint is not below it.
-    """
+    """Writes a mission of QGroundControl for ArduSub, relative to the sea surface (elevation 0); TwinError above it."""
     if (highest_m := float(path.crs[:, 2].max())) >= 0:
         problem = f"the path is up to {highest_m:.2f} m above the zero of the elevations, not below the sea surface"
         raise TwinError("--to qgc", problem, "--origin E,N,H, with H the elevation of z = 0 above the sea surface")

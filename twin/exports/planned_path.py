@@ -30,10 +30,7 @@ class PlannedPath(NamedTuple):
 
 
 def planned_path(mission: Mission, origin: Georeference | None) -> PlannedPath:
-    """Returns the planned path of the vehicle.
-
-    Raises TwinError if the scene has no place on the Earth: no georeference with a projected CRS between 80 S and 84 N.
-    """
+    """Returns the planned path; TwinError without a georeference with a projected CRS between 80 S and 84 N."""
     place = place_of(origin)
     if origin is None or place is None or origin.crs_wkt is None:
         allowed = "a DEM with a projected CRS, or --crs EPSG:CODE --origin E,N,H"

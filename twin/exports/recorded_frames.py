@@ -107,10 +107,7 @@ def missing_files(run: Run, scenario: Scenario, frames: Sequence[RecordedFrame])
 
 
 def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
-    """Returns the readings of the IMU in frames/imu.csv with their rate and noise; None if there is no such file.
-
-    Raises TwinError if the file is damaged, or the scenario has no IMU.
-    """
+    """Returns rate, noise and readings of frames/imu.csv, or None; TwinError if damaged, or the scenario has no IMU."""
     file = folder / "frames" / "imu.csv"
     if not file.is_file():
         return None

@@ -47,11 +47,8 @@ def export_obj(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _textured(contents: RunContents) -> tuple[trimesh.Trimesh, Array, PillowImage.Image]:
-    """Returns the mesh of a run in scene coordinates, its texture coordinates (n, 2), and its texture.
-
-    Texture coordinates are (0, 0) in the south-west and (1, 1) in the north-east corner of the texture. This is the
-    orthomosaic; without a file of it, it is `ElevationMap.mosaic`, one pixel per cell.
-    """
+    """Returns the mesh in the scene, texture coordinates (n, 2) from the south-west, and orthomosaic."""
+    # without a file of it, it is `ElevationMap.mosaic`, one pixel per cell
     elevation = contents.elevation
     assert elevation is not None  # by `ExportFormat.needs`
     texture = Raster(elevation.grid, elevation.mosaic)

@@ -75,10 +75,7 @@ def true_layers(
 
 
 def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
-    """Returns the true poses (n, 4, 4) of the left camera and velocities (n, 6) of the body, at frames 0 to n - 1.
-
-    The velocities are [angular, linear] in body axes [rad/s, m/s]. The file must have the frame with the number `last`.
-    """
+    """Returns true poses (n, 4, 4) of the left camera, body velocities (n, 6) [rad/s, m/s]; frames 0 to n > `last`."""
     with reading(file, "", "an undamaged file, written by `twin run`"):
         if not is_zipfile(file):
             raise ValueError("not an archive of NumPy")
@@ -129,10 +126,8 @@ def _truth(
     world_from_camera: Array,
     compared: tuple[Image, bool | None],
 ) -> FrameTruth:
-    """Returns the layers of one frame; the caller replaces `flow_px` and `clean`, which are not computed here.
-
-    `view` is the left image, rendered again; `compared` the recorded left image, and `FrameTruth.identical`.
-    """
+    """Returns the layers of one frame, without `flow_px` and `clean`, which the caller replaces."""
+    # `view` is the left image, rendered again; `compared` the recorded one, and `FrameTruth.identical`
     recorded, identical = compared
     normals = floor_normals(mission.rendered_terrain, view.depth, world_from_camera, mission.rig)
     labels = np.zeros(view.depth.shape, np.uint16)
@@ -150,11 +145,8 @@ def _truth(
 
 
 def _difference(recorded: Image, noise_free: Image) -> float:
-    """Returns the RMS of the recorded image minus a factor times the image rendered again [grey levels].
-
-    Only values below full scale in both images count; 0 without any. The factor, which makes the RMS smallest, stands
-    for the delay of auto-exposure, which the image rendered again lacks.
-    """
+    """Returns the RMS of an image minus a factor times its rendering [grey levels], below full scale in both, or 0."""
+    # The factor, which makes it smallest, stands for the delay of auto-exposure, which the rendering lacks.
     below = (recorded < 255) & (noise_free < 255)
     seen, rendered = recorded[below].astype(np.float64), noise_free[below].astype(np.float64)
     if not len(seen):
@@ -177,11 +169,8 @@ def _camera_in_clear_water(mission: Mission, world: RenderedWorld) -> StereoCame
 def floor_normals(
     terrain: Heights, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
 ) -> NDArray[np.float32]:
-    """Returns the unit normals (H, W, 3) of the floor in the axes of the camera; zero where there is no floor.
-
-    A point of the floor lies in the south-eastern or the north-western triangle of its cell of the height grid.
-    `depth_m` (H, W) is inf where there is no floor.
-    """
+    """Returns the unit normals (H, W, 3) of the floor in the axes of the camera; 0 where `depth_m` (H, W) is inf."""
+    # of the south-eastern or the north-western triangle of the cell of the height grid
     known = np.isfinite(depth_m)
     points = geometry.transform(world_from_camera, _points(np.where(known, depth_m, 1.0), rig).reshape(-1, 3))
     grid = (points[:, :2] - [terrain.west_m, terrain.south_m]) / terrain.spacing_m

@@ -31,10 +31,7 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
 def position_consistency(
     result: SurveyResult, moved: Array, true: Array, keyframes: NDArray[np.int64]
 ) -> dict[str, float | None]:
-    """Returns the metrics of positions for poses (n, 4, 4) of keyframes, moved to the truth, and true poses (n, 4, 4).
-
-    `keyframes` (n,) are their numbers.
-    """
+    """Returns the metrics of poses (n, 4, 4) of keyframes `keyframes` (n,), moved to the truth, and of true poses."""
     error, cov = _errors_in_camera(moved, true, result.node_cov[keyframes, 3:, 3:])
     low, high = nees_interval(result.quality.independent_errors) or (None, None)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
@@ -56,10 +53,7 @@ def _errors_in_camera(moved: Array, true: Array, cov: Array) -> tuple[Array, Arr
 
 
 def nees(error: Array, cov: Array) -> Array:
-    """Returns the normalised estimation error squared e' C^-1 e (n,) of errors (n, d) with covariances (n, d, d).
-
-    Its expectation is d for consistent covariances (Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2).
-    """
+    """Returns e' C^-1 e (n,) of errors (n, d), covariances (n, d, d); d is expected (Bar-Shalom et al. 2001, 5.4.2)."""
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0])
 
 

@@ -53,11 +53,7 @@ def _node_distance(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _link_errors(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
-    """Returns number, RMS errors and mean NEES of links, and the RMS errors of closed-form motions.
-
-    The error of a motion is log(T^-1 E) of the true motion T and the estimated motion E. The mean NEES is 6 for
-    consistent covariances.
-    """
+    """Returns number, RMS errors log(T^-1 E) and mean NEES (6 if consistent) of links, and those of closed forms."""
 
     def errors_of(some: Links, motions: Array) -> Array:
         return _motion_errors(world_from_keyframe[some.i], world_from_keyframe[some.j], np.ascontiguousarray(motions))

@@ -1,6 +1,7 @@
 """Errors of the orthomosaic against the true one: position, colour and resolution, tile by tile in bounded memory.
 
-The displacement of patches is that of the peak of their normalised cross-correlation.
+The displacement of patches is that of the peak of their normalised cross-correlation. The colour difference is
+CIEDE2000 (Sharma, Wu & Dalal 2005, doi 10.1002/col.20070).
 """
 
 from typing import NamedTuple
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from twin.core.ortho_tiles import OrthoTile
 from twin.core.records import Array
-from twin.judge.colour_difference import XYZ_FROM_RGB, ciede2000, lab_of
 from twin.judge.summary_statistics import finite_float, percentile
 
 Layer = NDArray[np.float32]
@@ -22,7 +22,11 @@ PATCH_PX, SEARCH_PX = 32, 8  # side of the patches that are matched, and largest
 LEAST_CORRELATION = 0.25
 _COLOUR_STEP_PX = 3  # spacing of the pixels whose colour is compared
 _BINS = np.linspace(0, 100, 10001)  # edges of the bins of the histogram of colour differences
-_LUMINANCE = XYZ_FROM_RGB[1].astype(np.float32)
+#: X, Y, Z (rows) of the primaries R, G, B (columns) of ITU-R BT.709 with the white point D65, relative to Y of white
+#: (IEC 61966-2-1).
+_XYZ_FROM_RGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+_25_TO_7 = 25.0**7
+_LUMINANCE = _XYZ_FROM_RGB[1].astype(np.float32)
 #: Distance from 10 % to 90 % of the edge response of a Gaussian blur, in standard deviations.
 _EDGE_PER_SIGMA = 2 * 1.2815515655446004
 #: Limits of the frequencies to which the blur is fitted: the highest frequency [1/px], and the smallest transfer as a
@@ -110,12 +114,8 @@ class OrthomosaicJudge:
 
 
 def _edge_width_px(cross: Array, power: Array) -> float | None:
-    """Returns the 10 % to 90 % edge width [px] of the Gaussian blur that best fits a modulation transfer function.
-
-    The function gain * exp(-2 (pi sigma f)^2) of the frequency f [1/px] is fitted to the ratio of `cross` and `power`
-    (n, n), the sums of the (cross-)spectra of the patches, over all directions. None with fewer than four usable
-    frequencies.
-    """
+    """Returns the 10 % to 90 % edge width [px] of the Gaussian blur that best fits `cross` / `power` (n, n)."""
+    # gain * exp(-2 (pi sigma f)^2) of the frequency f [1/px]; None with fewer than four usable frequencies
     n = len(power)
     f = np.hypot(np.fft.fftfreq(n), np.fft.fftfreq(n)[:, None])
     ring = np.rint(f * n).astype(int).ravel()
@@ -194,3 +194,34 @@ def transfer(patch: Layer, true: Layer, shift: PatchShift) -> tuple[Array, Array
     f = np.fft.fftfreq(n)
     phase = np.exp(2j * np.pi * (f * shift.right_px + f[:, None] * shift.down_px))
     return np.real(first * phase * np.conj(second)), np.abs(second) ** 2
+
+
+def lab_of(rgb: NDArray[np.floating]) -> Array:
+    """Returns the CIELAB coordinates L*, a*, b* (..., 3) of linear RGB colours (..., 3), 1 = white (D65)."""
+    relative = np.maximum(np.asarray(rgb, np.float64), 0) @ (_XYZ_FROM_RGB / _XYZ_FROM_RGB.sum(1, keepdims=True)).T
+    edge = 6 / 29
+    f = np.where(relative > edge**3, np.cbrt(relative), relative / (3 * edge**2) + 4 / 29)
+    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
+
+
+def ciede2000(first: Array, second: Array) -> Array:
+    """Returns the CIEDE2000 differences (...) of pairs of CIELAB colours (..., 3); about 1 is barely visible."""
+    l1, a1, b1 = np.moveaxis(np.asarray(first, np.float64), -1, 0)
+    l2, a2, b2 = np.moveaxis(np.asarray(second, np.float64), -1, 0)
+    mean_chroma = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2
+    stretch = 1 + (1 - np.sqrt(mean_chroma**7 / (mean_chroma**7 + _25_TO_7))) / 2
+    c1, c2 = np.hypot(stretch * a1, b1), np.hypot(stretch * a2, b2)
+    h1, h2 = np.arctan2(b1, stretch * a1) % (2 * np.pi), np.arctan2(b2, stretch * a2) % (2 * np.pi)
+    coloured = c1 * c2 > 0
+    turn = np.where(coloured, (h2 - h1 + np.pi) % (2 * np.pi) - np.pi, 0.0)
+    across = np.where(h1 + h2 < 2 * np.pi, np.pi, -np.pi) * (np.abs(h2 - h1) > np.pi)
+    hue = np.where(coloured, (h1 + h2) / 2 + across, h1 + h2)
+    lightness, chroma = (l1 + l2) / 2, (c1 + c2) / 2
+    t = 1 - 0.17 * np.cos(hue - np.pi / 6) + 0.24 * np.cos(2 * hue)
+    t += 0.32 * np.cos(3 * hue + np.pi / 30) - 0.20 * np.cos(4 * hue - np.deg2rad(63))
+    s_l = 1 + 0.015 * (lightness - 50) ** 2 / np.sqrt(20 + (lightness - 50) ** 2)
+    s_c, s_h = 1 + 0.045 * chroma, 1 + 0.015 * chroma * t
+    rotation = -2 * np.sqrt(chroma**7 / (chroma**7 + _25_TO_7))
+    rotation *= np.sin(np.deg2rad(60) * np.exp(-(((np.rad2deg(hue) - 275) / 25) ** 2)))
+    dl, dc, dh = (l2 - l1) / s_l, (c2 - c1) / s_c, 2 * np.sqrt(c1 * c2) * np.sin(turn / 2) / s_h
+    return np.sqrt(np.maximum(dl**2 + dc**2 + dh**2 + rotation * dc * dh, 0))

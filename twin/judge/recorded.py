@@ -159,10 +159,8 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
 
 
 def _interpolated(truth: Trajectory) -> bool:
-    """Returns whether speeds vary, but most steps have the same rotation per displacement as the step before.
-
-    That is a screw motion, by which poses are interpolated; the rotation of a real vehicle varies with its speed.
-    """
+    """Returns whether most steps have the rotation per displacement of the last at varying speed: a screw motion."""
+    # Poses are interpolated by it; the rotation of a real vehicle varies with its speed.
     poses = truth.world_from_camera[np.argsort(truth.times_s, kind="stable")]
     steps = [geometry.inverse(a) @ b for a, b in zip(poses[:-1], poses[1:], strict=True)]
     turns = np.array([geometry.so3_log(step[:3, :3]) for step in steps]).reshape(-1, 3)
@@ -176,11 +174,8 @@ def _interpolated(truth: Trajectory) -> bool:
 
 
 def _clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float, float] | None:
-    """Returns by how much the true times would have to be shifted [s], and the RMS misfit [m] with and without that.
-
-    The misfit is that of positions after a rigid alignment, with the truth interpolated; None if no shift within
-    `_MOST_OFFSET_S` reduces it to a fraction of `_CLEARLY`.
-    """
+    """Returns the shift of the true times [s] that clearly reduces the RMS misfit [m], without and with it; or None."""
+    # misfit after a rigid alignment, with the truth interpolated; shifts within `_MOST_OFFSET_S`
     order = np.argsort(truth.times_s, kind="stable")
     true_s, true_m, times_s = truth.times_s[order], truth.positions[order], estimate.times_s
     if len(true_s) < _MIN_ASSOCIATED:
@@ -205,12 +200,9 @@ def _clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float
 
 
 def _axis_turn_deg(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
-    """Returns the angle by which the axes of the true bodies are turned from those of the camera, and its sigma [deg].
-
-    It is that between the rotation that fits the positions and the one that fits the attitudes. The standard deviation
-    is that of a jackknife that leaves out one of `_BLOCKS` parts of the path at a time (Kuensch 1989), so errors
-    correlated along the path count; over a nearly still path it is as large as the angle.
-    """
+    """Returns the turn of the axes of true bodies from those of the camera, and its sigma by jackknife [deg]."""
+    # That between the rotations that fit positions and attitudes; without one of `_BLOCKS` parts of the path at a time
+    # (Kuensch 1989), so correlated errors count; over a nearly still path it is as large as the angle.
     block = np.arange(len(truth)) * _BLOCKS // len(truth)
     kept = [block != k for k in range(-1, _BLOCKS)]  # first all rows
     turns = [_axis_turn(_selected(estimate, rows), _selected(truth, rows)) for rows in kept]
@@ -290,11 +282,7 @@ def _height_at(true: TrueMap, x: Array, y: Array) -> Array:
 
 
 def recorded_map_metrics(elevation: ElevationMap, heights: NDArray[np.float32]) -> dict[str, float | None]:
-    """Returns `map.*` of metrics.json for a map and its true heights (rows, cols) (`true_heights`).
-
-    Errors are those of all cells that have both. Metrics that need more than heights, completeness among them, are
-    None.
-    """
+    """Returns `map.*` of metrics.json over the cells (rows, cols) with `true_heights`; None if it needs more."""
     cells = np.isfinite(heights)
     return map_metrics(elevation, truth_without_flight(heights, cells, np.zeros_like(cells))) | dict.fromkeys(_UNKNOWN)
 

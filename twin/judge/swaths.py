@@ -76,11 +76,8 @@ def is_turning(yaw: Array) -> NDArray[np.bool_]:
 
 
 def leg_numbers(reference: Array) -> NDArray[np.int64]:
-    """Returns the number (n,) of the leg of each frame, from 0; -1 on the short segments between legs.
-
-    Legs are parallel to the first step between the reference positions (n, 3). A leg ends where the direction of travel
-    reverses or a short segment begins.
-    """
+    """Returns the leg (n,) of each frame, from 0, or -1 between legs, from reference positions (n, 3)."""
+    # Legs are parallel to the first step; one ends where the direction of travel reverses or a short segment begins.
     direction = travel_direction(reference)
     cosine = direction @ direction[0] if len(direction) else np.zeros(0)
     on_leg = np.where(np.abs(cosine) > ON_LEG_COSINE, np.sign(cosine), 0.0)
@@ -177,11 +174,8 @@ def image_pairs(poses: KeyframePoses, both_ways: bool = False) -> tuple[ImagePai
 
 
 def _across_pairs(poses: KeyframePoses) -> ImagePairs:
-    """Returns pairs of a keyframe and a hypothetical image abreast of it on the next swath: sidelap.
-
-    It has the pose of the nearest keyframe of the next swath, shifted along the direction of travel until the two are
-    abreast: otherwise the overlap would depend on where the keyframes of the two swaths happen to lie.
-    """
+    """Returns pairs of a keyframe and an image with the pose of the next swath's nearest keyframe, moved abreast."""
+    # not the keyframes themselves, as the sidelap would depend on where they happen to lie
     pairs = [_nearest_in_next(poses, swath) for swath in range(int(poses.swath.max(initial=-1)))]
     first, second = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0), np.int64)
     abreast, travel = poses.world_from_camera[second], poses.travel[first]

@@ -101,11 +101,9 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 
 
 def keyframe_errors_m(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> Array:
-    """Returns the position errors (min(n, m),) of the first keyframes of a survey [m], anchored at the first true pose.
+    """Returns the position errors (min(n, m),) of the first keyframes [m], anchored at the first true pose.
 
-    Args:
-        positions: (n, 3) estimated positions of the first n keyframes, not yet anchored [m].
-        frames: (m,) frame numbers of the first m keyframes.
+    `positions` (n, 3) [m] are the estimated ones, not yet anchored, `frames` (m,) frame numbers of the first keyframes.
     """
     n = min(len(positions), len(frames))
     if n == 0:

@@ -29,11 +29,8 @@ class ExpectedError(NamedTuple):
     fitted_bound_px: float  #: largest bound of the surveys to which the error model was fitted
 
     def percentile_m(self, percent: float, holes: float = 0.0) -> float | None:
-        """Returns a percentile of the absolute height error; None if it is infinite or no floor is in view.
-
-        The error is a mixture of zero-mean normal distributions with the standard deviations `sigma_m`; it is infinite
-        in holes of the map, a share of the area.
-        """
+        """Returns a percentile of the absolute height error; None if it is infinite or no floor is in view."""
+        # a mixture of zero-mean normal distributions of `sigma_m`; infinite in holes, a share of the area
         share = percent / 100
         if share >= 1 - holes or len(self.sigma_m) == 0:
             return None

@@ -117,11 +117,8 @@ def axes_of(vehicle: VehicleConfig) -> dict[str, tuple[float, float, float]]:
 
 
 def largest_latency_s(mission: Mission) -> float:
-    """Returns the greatest latency in whole frames, up to a second, with which the vehicle flies a leg and stops [s].
-
-    A vehicle that is steered by fins does not stop. It starts at the planned speed with its true motion known, and has
-    to be within `_STABLE_M` of its reference after `_SETTLED_S`.
-    """
+    """Returns the greatest latency up to 1 s [s], in frames, with which the vehicle flies a leg and stops."""
+    # from the planned speed, true motion known, to within `_STABLE_M` after `_SETTLED_S`; with fins, it does not stop
     interval_s = 1 / mission.rig.frame_rate_hz
     latencies = interval_s * np.arange(1, round(1 / interval_s) + 1)
     return next((float(late_s - interval_s) for late_s in latencies if not _settles(mission, late_s)), latencies[-1])

@@ -56,10 +56,7 @@ class RecordedFrames:
         return self.following(0, 0)
 
     def following(self, n_read: int, index: int, skipped: Counter[str] | None = None) -> Iterator[Frame]:
-        """Yields the usable frames after the first `n_read` of the data set, with indices from `index` on.
-
-        `skipped` are the counts of the frames before; None: there are none.
-        """
+        """Yields the usable frames after the first `n_read`, from `index` on; `skipped` counts those before."""
         self.skipped, self.n_read = Counter[str](skipped), n_read
         if skipped is None and self.dataset.n_right_only:
             self.skipped["right image without left image"] = self.dataset.n_right_only

@@ -36,50 +36,34 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Options of a replay.
+    """Options of a replay."""
 
-    Args:
-        calibration: calibration file; None: that of the data set.
-        truth: file of true poses, or for a ROS 2 bag the topic of true poses; None: that of the data set.
-        alignment: how the estimates are moved to the truth before the comparison.
-        bayer: pattern of raw images; None: grey or colour images.
-        settings: settings of the estimators, of which `window_tracks` and `wide_search` are replaced; None: the
-            defaults.
-        start: (4, 4) pose world_from_camera of the rectified left camera at the first frame; None: z is up by the
-            recorded attitude or, without one, the plane z = 0 of the world is the floor plane of the first pair
-            (`floor_plane`).
-        outputs: outputs in addition to metrics, trajectories and maps: "report", "recording".
-        topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
-        estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
-            whose poses the map is built; None: the estimators of `twin.estimate`.
-        aiding: whether recorded readings of pressure, attitude, DVL and IMU are used.
-        imu: whether the recorded IMU predicts the motion between frames.
-        true_map: GeoTIFF of the true heights [m] in the frame of the true poses; None: that of the data set.
-        rotation_sigma_deg, baseline_sigma_mm: standard deviations of the rotation between the cameras (about each axis)
-            and of the baseline since the calibration; above 0, yaw and baseline are estimated. None: those of the data
-            set, which are 0 unless the twin exported it.
-        frames: frames of the data set that are used, by their numbers from 0 in the order of its list.
-        baseline_m: distance between the cameras, for a calibration in other units than metres; None: its own.
-        fov_deg: horizontal field of view of the rectified images; None: that of `rectification`.
-    """
-
-    calibration: Path | None = None
-    truth: Path | None = None
-    alignment: AlignmentName = "first"
-    bayer: Bayer | None = None
+    calibration: Path | None = None  #: calibration file; None: that of the data set
+    truth: Path | None = None  #: file of true poses, or topic of them in a ROS 2 bag; None: that of the data set
+    alignment: AlignmentName = "first"  #: how the estimates are moved to the truth before the comparison
+    bayer: Bayer | None = None  #: pattern of raw images; None: grey or colour images
+    #: Settings of the estimators, of which `window_tracks` and `wide_search` are replaced; None: the defaults.
     settings: EstimatorSettings | None = None
+    #: (4, 4) pose world_from_camera of the rectified left camera at the first frame; None: z is up by the recorded
+    #: attitude or, without one, the plane z = 0 of the world is the floor plane of the first pair (`floor_plane`).
     start: Array | None = None
+    #: Outputs in addition to metrics, trajectories and maps: "report", "recording".
     outputs: Collection[str] = OPTIONAL_OUTPUTS
-    topics: tuple[str, str] | None = None
+    topics: tuple[str, str] | None = None  #: image topics (left, right) of a ROS 2 bag; None: its only stereo pair
+    #: Estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from whose poses
+    #: the map is built; None: the estimators of `twin.estimate`.
     estimator: str | None = None
-    aiding: bool = True
-    true_map: Path | None = None
+    aiding: bool = True  #: whether recorded readings of pressure, attitude, DVL and IMU are used
+    true_map: Path | None = None  #: GeoTIFF of true heights [m] in the frame of the true poses; None: of the data set
+    #: Standard deviations of the rotation between the cameras (about each axis) and of the baseline since the
+    #: calibration; above 0, yaw and baseline are estimated. None: those of the data set, 0 unless the twin exported it.
     rotation_sigma_deg: float | None = None
     baseline_sigma_mm: float | None = None
-    imu: bool = False
+    imu: bool = False  #: whether the recorded IMU predicts the motion between frames
+    #: Frames of the data set that are used, by their numbers from 0 in the order of its list.
     frames: slice = field(default_factory=lambda: slice(None))
-    baseline_m: float | None = None
-    fov_deg: float | None = None
+    baseline_m: float | None = None  #: distance between the cameras, for other units than metres; None: its own
+    fov_deg: float | None = None  #: horizontal field of view of the rectified images; None: that of `rectification`
 
     def with_sigmas(self, calibration: StereoCalibration) -> StereoCalibration:
         """Returns a calibration with the standard deviations that are given; raises TwinError if one is not valid."""
@@ -201,11 +185,8 @@ def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions
 
 
 def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Trajectory | None:
-    """Returns the true poses of the rectified left camera, at times relative to the first frame; None without a truth.
-
-    Raises TwinError if the truth is damaged or has no poses, a true position is impossible, or there are several frames
-    and none of them has a true pose at its time (`associate`).
-    """
+    """Returns true poses of the rectified left camera, relative to the first frame in time; None without a truth."""
+    # TwinError if damaged, empty or impossible, or if none of several frames has a true pose (`associate`)
     truth, source = _sound(dataset.truth if file is None else read_truth(file, dataset)), str(file or dataset.folder)
     if truth is None:
         return None

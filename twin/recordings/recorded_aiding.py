@@ -92,11 +92,8 @@ class Aiding:
         return [*self._series, *(["imu"] if self._imu is not None else [])]
 
     def at(self, time_s: float, since_s: float | None = None) -> Readings:
-        """Returns the readings of a frame at a time [s] since the first one; None where a sensor has none near it.
-
-        Height and attitude are the readings nearest in time, the others are interpolated. Those of the IMU are all
-        since the last frame, at `since_s`; None: of the last `_FIRST_IMU_S`.
-        """
+        """Returns the readings at a time [s] since the first frame (IMU: from `since_s`); None without one near it."""
+        # height and attitude are the nearest, others interpolated; `since_s` None: of the last `_FIRST_IMU_S`
         series, limit_s = self._series.get, self._limit_s
         height, attitude = (_nearest(series(name), time_s, limit_s) for name in ("pressure", "attitude"))
         up, velocity = (_interpolated(series(name), time_s) for name in ("vertical", "dvl"))
@@ -210,11 +207,7 @@ class Aiding:
         return found
 
     def residuals(self, path: Trajectory) -> dict[str, float]:
-        """Returns the RMS of (path - reading) / sigma at the frames of a path: "pressure", "attitude", "vertical".
-
-        About 1 is expected. A sensor without readings is left out; velocities are not compared. The path has poses of
-        the rectified left camera in the world of the replay.
-        """
+        """Returns the RMS of (path - reading) / sigma, about 1, of "pressure", "attitude", "vertical" that have any."""
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
         parts = {name: list[Array]() for name in ("pressure", "attitude", "vertical")}
         for time_s, pose in zip(path.times_s, path.world_from_camera, strict=True):

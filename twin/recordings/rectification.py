@@ -82,12 +82,9 @@ def rectification(calibration: StereoCalibration, frame_rate_hz: float, fov_deg:
 
 
 def _wide_matrix(calibration: StereoCalibration, turns: tuple[Array, Array], fov_deg: float | None) -> Array:
-    """Returns the common camera matrix (3, 3) of lenses of any model; not finite if the views do not overlap.
-
-    By default, the focal length keeps `_KEPT` of the resolution at the centre (an image of the same size that holds all
-    of a wide field is coarse there), or more if the rectified images then lie in the recorded ones. `turns` are
-    rectified_from_recorded (3, 3) of both cameras.
-    """
+    """Returns the common camera matrix (3, 3) of any lenses (`turns`); not finite if the views do not overlap."""
+    # By default, the focal length keeps `_KEPT` of the resolution at the centre (an image of the same size that holds
+    # all of a wide field is coarse there), or more if the rectified images then lie in the recorded ones.
     cameras, (width_px, height_px) = (calibration.left, calibration.right), calibration.left.size_px or (0, 0)
     principal = np.mean([camera.matrix[:2, 2] for camera in cameras], axis=0)
     ahead = np.mean([turn[:2, 2] / turn[2, 2] for turn in turns], axis=0)  # the optical axes in rectified axes
@@ -124,11 +121,9 @@ def _field_deg(camera: RecordedCamera) -> float:
 
 
 def is_rectified(calibration: StereoCalibration) -> bool:
-    """Returns whether the recorded images are a rectified pair, but for a shift of the right image along its rows.
-
-    Such a pair has no distortion, parallel axes, a baseline along the image rows, and equal focal lengths and rows of
-    the principal points. Their columns may differ, as in the Middlebury data sets.
-    """
+    """Returns whether the recorded images are rectified, but for a shift of the right one along its rows."""
+    # no distortion, parallel axes, a baseline along the rows, equal focal lengths and rows of the principal points;
+    # their columns may differ, as in the Middlebury data sets
     left, right = calibration.left, calibration.right
     offset = calibration.right_from_left[:3, 3]
     parallel = np.linalg.norm(geometry.so3_log(calibration.right_from_left[:3, :3])) < _PARALLEL_RAD

@@ -126,10 +126,7 @@ def _replay(
 def _checkpoints(
     opened: OpenedDataset, options: ReplayOptions, description: str, out: Path, interval_s: float | None
 ) -> Checkpoints:
-    """Returns the checkpoints of a replay, which belong to its data set, its files, its options and this program.
-
-    Of images in files of their own, only names and times are compared.
-    """
+    """Returns the checkpoints of a replay of this data set, files, options and program (of images, names and times)."""
     frames = [(images.time_s, images.left.name, images.right and images.right.name) for images in opened.dataset.images]
     named = repr((description, replace(options, settings=None), frames)).encode()
     folder, given = opened.dataset.folder, (options.calibration, options.truth, options.true_map)
@@ -158,11 +155,8 @@ def _estimate_in_stage(
 
 
 def _setup(opened: OpenedDataset, options: ReplayOptions, settings: EstimatorSettings) -> tuple[EstimatorSetup, Start]:
-    """Returns the rectified rig, the start and the noise of the readings, and the uncertainty of the start.
-
-    The start is that of the options; without one, that from the readings; without either, the camera above the floor
-    plane of the first pair.
-    """
+    """Returns rectified rig, start, noise of the readings, and uncertainty of the start."""
+    # start: of the options, else from the readings, else above the floor plane of the first pair
     rig, over_plane, aiding = opened.frames.rectification.rig, opened.plane.world_from_camera, opened.aiding
     start, noise = Start(over_plane if options.start is None else options.start), SensorNoise()
     if aiding is not None:

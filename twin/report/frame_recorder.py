@@ -39,10 +39,7 @@ class FrameRecorder:
     `frames.csv` has index, time, exposure and sensor readings (without beacons and IMU) of every frame, and whether it
     has a stereo pair; `imu.csv` the readings of the IMU in body axes; `truth.npz` true poses and velocities in double
     precision. With `record` = "all", `left` and `right` have the images as PNG files; with "keyframes" they are those
-    in `keyframes`; with "none", nothing is written.
-
-    Raises:
-        OSError: the folder cannot be written, or on exit one of the last images could not be written.
+    in `keyframes`; with "none", nothing is written. OSError if the folder cannot be written, or on exit an image.
     """
 
     def __init__(self, folder: Path, record: Record):

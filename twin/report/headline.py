@@ -78,11 +78,7 @@ class KeyFigure(NamedTuple):
 
 
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:
-    """Returns the summary of a survey or replay: status, conditions, final position error and map quality.
-
-    `metrics` are the contents of metrics.json (None: unfinished), `scenario` those of the scenario file. `first_lines`
-    returns the limitations of these results.
-    """
+    """Returns the summary from metrics.json (None: unfinished) and scenario: status, conditions, final errors."""
     if metrics is None and "replay" in scenario:
         return "This replay is unfinished: it has no metrics.json."
     if metrics is None:

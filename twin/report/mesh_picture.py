@@ -24,14 +24,9 @@ _FINER = 2  # the picture is drawn with so many times more rows and columns, and
 
 
 def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Image | None:
-    """Returns an oblique view of the mesh from the south-south-east, (h, w, 3) RGB, lit from the north-west.
+    """Returns an oblique view (h, w, 3) RGB of a map_mesh file, lit from the north-west; None if it cannot be read.
 
-    None without the file, or if it cannot be read.
-
-    Args:
-        mesh_file: the mesh in the world (`twin.exchange.mesh.map_mesh`).
-        map_from_world: (4, 4) pose of the world in the map, whose axes are east, north and up of the picture; None: the
-            identity.
+    `map_from_world` (4, 4) is the pose of the world in the map, whose axes are those of the picture; None: identity.
     """
     if not mesh_file.is_file():
         return None

@@ -126,11 +126,7 @@ def height_scale(heights: np.ndarray) -> tuple[float, float]:
 
 
 def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None = None) -> np.ndarray:
-    """Returns hill-shaded RGBA colours (rows, cols, 4), lit from the north-west; cells without data are transparent.
-
-    Heights (rows, cols) [m] are clipped to `scale`, the ends of the colour map (by default `height_scale`): a single
-    outlier would remove the shading from all other cells.
-    """
+    """Returns RGBA (rows, cols, 4) of heights [m] within `scale`, lit from the north-west; clear without data."""
     empty = ~np.isfinite(heights)
     low, high = scale or height_scale(heights)
     filled = np.clip(np.where(empty, (low + high) / 2, heights), low, high)

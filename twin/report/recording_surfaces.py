@@ -49,10 +49,7 @@ def in_world(surface: Surface, map_from_world: Array) -> Surface:
 
 
 def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
-    """Returns whether two grids have the same north-west corner and the same size but for a cell and a pixel.
-
-    A reduced orthomosaic lacks rows and columns that do not fill a reduced pixel.
-    """
+    """Returns whether grids have one north-west corner and size, up to a cell and a (reduced) pixel."""
     corner = np.array([pixels.west_m - cells.west_m, pixels.north_m - cells.north_m])
     size = np.array([pixels.cols, pixels.rows]) * pixels.cell_m - np.array([cells.cols, cells.rows]) * cells.cell_m
     tolerance_m = 1e-3 * min(cells.cell_m, pixels.cell_m)

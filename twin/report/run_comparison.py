@@ -65,11 +65,7 @@ QUANTITIES = (
 
 
 class Cell(NamedTuple):
-    """Value of one run in the table, and its difference from that of the first run; None if it is missing.
-
-    `change` is the difference as text ("+1.2 mm (+10 %)", "same"), `level` "good" or "bad" against the first run, or
-    "".
-    """
+    """Value of one run in the table, its difference from the first as text, and "good", "bad" or "" for it."""
 
     value: float | None
     text: str
@@ -257,13 +253,9 @@ def _compared(quantity: ComparedQuantity, value: float | None, first: float | No
     level = "" if better is None else "good" if better else "bad"
     change = f"{'+' if difference > 0 else '-'}{quantity.text(abs(difference))}"
     if quantity.text is not percent and first > 0:
-        change += f" ({_relative(value / first)})"
+        factor = value / first
+        change += f" ({100 * (factor - 1):+.0f} %)" if factor < 3 else f" ({ratio(factor)})"
     return Cell(value, text, difference, change, level)
-
-
-def _relative(factor: float) -> str:
-    """Returns the ratio of two values as text: as a change in percent, e.g. "+10 %", below 3, otherwise as a factor."""
-    return f"{100 * (factor - 1):+.0f} %" if factor < 3 else ratio(factor)
 
 
 def _json(value: Any) -> str:

@@ -72,22 +72,12 @@ class _OptionalText:
 
 
 def conform(given: Any, template: Any, key: str = "", complete: bool = False) -> Any:
-    """Checks that a value has the structure of a template, and returns it.
+    """Returns a value after a check that it has the structure of a template; else ValueError, which names its `key`.
 
-    A template is one of:
-        a table: a value for each of its keys, or for any other key under "*"; without "*", others are unchecked.
-        a list: the template of all items is its only item, if it has one.
-        a string, a Boolean or a finite number: the value is of this type.
-        `_OptionalText`: a string or None.
-        None: a finite number or None; NaN: a number, NaN or None.
-
-    Args:
-        key: dotted key of the value, for the message.
-        complete: whether to add missing keys to tables (not to those in lists): None for numbers, Booleans and optional
-            strings, [] for lists; another missing string is an error.
-
-    Raises:
-        ValueError: the value does not have this structure, or an item of a list lacks a key; the message names the key.
+    A table has a value for each of its keys, or for any other under "*"; without "*", others are unchecked. The only
+    item of a list, if any, is that of all items. A string, a Boolean or a finite number stand for their types,
+    `_OptionalText` for a string or None, None for a finite number or None, NaN for a number, NaN or None. With
+    `complete`, missing keys of tables (not of those in lists) are None or, for lists, []; a missing string is an error.
     """
     if isinstance(template, dict):
         _require(isinstance(given, dict), key, given, "a table")

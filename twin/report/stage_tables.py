@@ -89,11 +89,7 @@ class StageTime(NamedTuple):
 def stage_times(
     metrics: Mapping[str, Any], scenario: Mapping[str, Any], n_frames_per_keyframe: int | None
 ) -> list[StageTime]:
-    """Returns the computing time of every stage and, as the last item, of all keyframe work.
-
-    `metrics` and `scenario` are the contents of metrics.json and of the scenario file; the number of frames from one
-    keyframe to the next is None if unknown.
-    """
+    """Returns the computing times of all stages and, as the last item, of all keyframe work, from metrics.json."""
     timing = metrics.get("timing") or {}
     stages = timing.get("stages") or {}
     rate_hz = scenario.get("rig", {}).get("frame_rate_hz")

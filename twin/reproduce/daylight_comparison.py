@@ -45,12 +45,9 @@ def daylight_cells(selection: Selection = ALL_DAYLIGHT, walks: int = WALKS) -> I
 
 
 def _compared(water_type: str, elevation_deg: float, depth_m: float, range_m: float, walks: int) -> dict[str, Compared]:
-    """Returns the light for an illuminance of 1 lx just below the water surface, by model and reference.
-
-    level, to_sun and from_sun are the illuminances of a level plane at the camera and of two slopes of `SLOPE_DEG` on
-    the floor [lx], over a black floor in the reference; veil and lu are the upwelling radiances at the camera over a
-    black floor and over one of albedo `ALBEDO` / 255 [cd/m2].
-    """
+    """Returns the light for 1 lx just below the water surface, by model and reference."""
+    # level, to_sun, from_sun: illuminance of a level plane at the camera and of slopes of `SLOPE_DEG` on the floor
+    # [lx]; veil, lu: upwelling radiance at the camera over a black floor and one of albedo `ALBEDO` / 255 [cd/m2]
     water = medium(WaterConfig.model_validate({"jerlov": water_type}))
     sun = SunConfig(illuminance_lx=1.0, depth_m=depth_m + range_m, elevation_deg=elevation_deg)
     daylight = daylight_at(sun, water, range_m)

@@ -57,10 +57,7 @@ QUICK_LAMPS: Selection = (("IB", "III"), ("leds",), (2.0,), PIXELS[:2])
 
 
 def lamp_cells(selection: Selection = ALL_LAMPS, walks: int = WALKS, phase: str = "sea") -> Iterable[LightCell]:
-    """Yields the cells of a selection: conditions, with the light of a pixel by the model and by the reference.
-
-    A cell has at most `walks` pairs of random walks; `phase` is a value of `water.phase_function`.
-    """
+    """Yields cells of at most `walks` pairs of walks: a pixel by model and reference; `phase` of the scenario."""
     waters, arrangements, heights_m, pixels = selection
     for water, lamps in product(waters, arrangements):
         settings = f"water.jerlov={water}", f"water.phase_function={phase}", "sun.illuminance_lx=0"
@@ -74,12 +71,9 @@ def lamp_cells(selection: Selection = ALL_LAMPS, walks: int = WALKS, phase: str 
 
 
 def _compared(scenario: Scenario, height_m: float, pixel: tuple[int, int], walks: int) -> dict[str, Compared]:
-    """Returns the light of a pixel by the model and by the reference (`PixelLight`).
-
-    sharp_share is the share of the total that comes from the floor and was not scattered between floor and camera;
-    blur_near and blur_far are shares of the blurred light whose point of the floor would, without scattering, be imaged
-    within `NEAR_PX` of the pixel and beyond `FAR_PX`.
-    """
+    """Returns the light of a pixel by the model and by the reference (`PixelLight`)."""
+    # sharp_share: from the floor, not scattered up to the camera; blur_near and blur_far: shares of the blurred light
+    # whose point of the floor would, without scattering, be imaged within `NEAR_PX` of the pixel and beyond `FAR_PX`
     truth = estimate(lambda one: reference_light(scenario, height_m, pixel, one), _is_accurate, walks)
     model = model_light(scenario, height_m, pixel)
     near, far = _blur_shares(truth)

@@ -58,19 +58,13 @@ def fly_in_parallel(flights: Mapping[str, tuple[Callable[[Scenario, str], Flown]
 
 
 def fly_aligned(scenario: Scenario, name: str = "") -> Flown:
-    """Flies a mission; the network is aligned after each track. With a name, long flights print lines of progress.
-
-    Raises TwinError if the mission cannot be prepared, or no stereo pair became a keyframe.
-    """
+    """Flies a mission, aligned after each track; `name` prints progress; TwinError if invalid or without keyframe."""
     return _fly(prepare(scenario), make_navigator, name)
 
 
 def fly_without_alignment(scenario: Scenario, name: str = "") -> Flown:
-    """Flies a mission on the integrated F2F motion, without F2M and GA, and maps along the F2F trajectory.
-
-    This is the case of Negahdaripour & Madjidi (2003, Fig. 7c): the path drifts, so the images do not cover the whole
-    area, and the map has holes. Arguments and errors as for `fly_aligned`.
-    """
+    """Flies a mission on the integrated F2F motion, without F2M and GA, and maps along it; see `fly_aligned`."""
+    # Negahdaripour & Madjidi (2003, Fig. 7c): the path drifts, so images miss some of the area, and the map has holes.
     estimate = scenario.estimate.model_copy(update={"use_f2m": False, "use_ga": False, "max_links": 1})
     return _fly(prepare(scenario.model_copy(update={"estimate": estimate})), _f2f_navigator, name)
 

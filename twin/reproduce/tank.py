@@ -129,10 +129,7 @@ def _map_table(survey: TankSurvey) -> Table:
 
 
 def flagged_share(error_m: Array, sigma_m: Array) -> float | None:
-    """Returns the share of the bad cells (`BAD_M`) that are among the 20 % with the largest sigma; None if none is bad.
-
-    Height error and sigma are (rows, cols) [m], NaN where unknown.
-    """
+    """Returns the share of cells (rows, cols) worse than `BAD_M` among the 20 % of largest sigma; None if none is."""
     known = np.isfinite(error_m) & np.isfinite(sigma_m)
     bad = np.abs(error_m[known]) > BAD_M
     if not bad.any():

@@ -121,11 +121,8 @@ _TOPS: dict[str, Callable[[Window], float]] = {"box": _plateau, "disc": _plateau
 
 
 def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
-    """Returns the distance between the outermost places on both sides of 0 where a profile rises to a level [m].
-
-    The profile has heights (n,) at places (n,) [m]; NaN heights are ignored. Holes and mismatches on top of an object
-    do not count, because the level is sought from outside to inside. NaN if `_rise` is, on one of the sides.
-    """
+    """Returns the distance between the outermost rises (`_rise`) of heights (n,) at places (n,) to a level [m]."""
+    # from outside to inside, so that holes and mismatches on top of an object do not count; NaN heights are ignored
     known = np.isfinite(height_m)
     if not np.isfinite(level_m) or not known.any():
         return np.nan
@@ -135,10 +132,8 @@ def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
 
 
 def _rise(at: Array, above: Array) -> float:
-    """Returns the place farthest from 0 at which heights (n,) above the level, on one side of 0, become positive [m].
-
-    It is interpolated linearly; NaN if the profile does not rise, or is above the level at its end.
-    """
+    """Returns the place farthest from 0 at which heights (n,) above a level turn positive [m], interpolated; or NaN."""
+    # NaN if the profile does not rise, or is above the level at its end
     order = np.argsort(-np.abs(at))
     at, above = at[order], above[order]
     higher = np.flatnonzero(above > 0)

@@ -22,10 +22,7 @@ from twin.simulate.thrusters import steady_thrust_n
 def nominal_controller(
     vehicle: VehicleConfig, natural_frequency_radps: float, frame_rate_hz: float, velocity_lag_s: float = 0.0
 ) -> ControllerState:
-    """Returns a controller for a vehicle, with this frequency in position and a command per frame.
-
-    `velocity_lag_s` is the time by which the velocity that it is given lags behind the true one.
-    """
+    """Returns a controller of this frequency in position, with a command per frame and a lag of the velocity [s]."""
     rov, lag_s = parameters_of(vehicle), velocity_lag_s + thruster_lag_s(vehicle)
     model = _controller_model(trimmed_hull(vehicle.model_copy(update={"drag_factor": 1.0, "added_mass_factor": 1.0})))
     gains = pole_placement_gains(natural_frequency_radps)
@@ -56,10 +53,7 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
 
 
 def thrust_loads(vehicle: VehicleConfig, velocities: Array, pulls: Array | float = 0.0) -> Array:
-    """Returns the largest absolute thrust (n,) of a thruster / full thrust, at steady velocities (n, 3).
-
-    Velocities [m/s] are through the water, in the body, which is level; `pulls` as in `steady_thrusts_n`.
-    """
+    """Returns the largest thrust (n,) / full thrust at steady velocities (n, 3) [m/s]; see `steady_thrusts_n`."""
     thrusts = steady_thrusts_n(vehicle, velocities, pulls)
     return np.abs(thrusts).max(axis=1, initial=0.0) / full_thrust_n(vehicle)
 

@@ -28,10 +28,7 @@ AT_REST = np.zeros(3)
 
 
 class RigidBodyState(NamedTuple):
-    """State and parameters of a rigid body in water; the arrays of the state are modified in place.
-
-    The velocity is [linear in world axes, angular in body axes] [m/s, rad/s].
-    """
+    """State [linear in world, angular in body axes] [m/s, rad/s] and parameters of a body; changes in place."""
 
     pose: Array  #: (4, 4) true pose world_from_body
     velocity: Array  #: (6,) velocity half a timestep before the time of the pose

@@ -93,10 +93,7 @@ def touches_floor(floor, pose):
 
 @kernel
 def touches_mesh(half, vertices, faces):
-    """Returns whether a box meets a triangle of `faces` (m, 3).
-
-    `half` (3,) are half the sides of the box, `vertices` (n, 3) are in its axes [m].
-    """
+    """Returns whether a box of half sides `half` (3,) meets a triangle (m, 3) of vertices (n, 3) in its axes [m]."""
     for f in range(len(faces)):
         if _meets(half, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]):
             return True

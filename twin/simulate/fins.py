@@ -76,10 +76,7 @@ def velocity_through_water(world_from_body, velocity, flow):
 
 @kernel
 def add_fins(wrench, fins, relative):
-    """Adds the forces of the fins to a wrench (6,) [moment, force] in body axes [N m, N].
-
-    `relative` (6,) is the [angular, linear] velocity through the water in body axes [rad/s, m/s].
-    """
+    """Adds the forces of the fins to a wrench (6,) [N m, N] at a `relative` velocity (6,) [rad/s, m/s] in the body."""
     for n in range(len(fins.angle_rad)):
         x, y, z = fins.position_m[n]
         left, up = fins.normal[n]

@@ -53,11 +53,8 @@ def _add_cross(out: Array, at: int, sign: float, a: Array, i: int, b: Array, j: 
 
 @kernel
 def acceleration(hull: Hull, world_from_body: Array, twist: Array, flow: Array, wrench: Array) -> Array:
-    """Returns the acceleration nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2].
-
-    At a rotation (3, 3) and a twist (6,) in body axes, in the flow (5, 3) of `sea.flow_at`, under the wrench (6,)
-    [moment, force] of the thrusters in body axes [N m, N].
-    """
+    """Returns nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2]."""
+    # at a rotation (3, 3), twist (6,) in the body, flow (5, 3) of `sea.flow_at`, wrench (6,) of thrusters [N m, N]
     current = np.zeros(6)  # R'v_c
     up = np.zeros(3)
     for k in range(3):

@@ -31,10 +31,7 @@ class KinematicVehicle:
         return np.concatenate([np.zeros(3), self._velocity @ self.world_from_body[:3, :3]])
 
     def step(self, command: Array, duration_s: float) -> None:
-        """Moves the vehicle by a velocity command (3,) in world axes [m/s], without its vertical part.
-
-        Raises SurveyAborted if the command is not finite, or the hull touches an obstacle.
-        """
+        """Moves the vehicle by a horizontal velocity (3,) [m/s]; SurveyAborted if not finite or the hull touches."""
         if not np.isfinite(command).all():
             raise SurveyAborted(f"the commanded velocity is not finite at {self.time_s:.3f} s")
         velocity = np.array([command[0], command[1], 0.0])

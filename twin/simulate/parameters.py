@@ -69,10 +69,7 @@ def _matrix(diagonal: Sequence[float], full: Sequence[Sequence[float]] | None) -
 
 
 def moves_along_all_axes(vehicle: VehicleConfig, lost: Sequence[int] = ()) -> bool:
-    """Returns whether the thrusters can push along each axis and turn about the vertical, independently.
-
-    `lost` are the indices of thrusters that do not push.
-    """
+    """Returns whether thrusters, without those `lost` (indices), push along each axis and turn about the vertical."""
     surge, sway, heave, _, _, yaw = range(6)
     left = np.delete(parameters_of(vehicle).thrust_configuration, lost, axis=1)
     return np.linalg.matrix_rank(left[[surge, sway, heave, yaw]]) == 4

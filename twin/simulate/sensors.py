@@ -148,10 +148,8 @@ def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:
 
 
 def inertial_quantities(rotation: Array, rate_radps: Array, acceleration_mps2: Array) -> Array:
-    """Returns the true [angular rate, specific force R' (a + g z)] (6,) in body axes [rad/s, m/s2].
-
-    R is the rotation (3, 3) world_from_body, a the acceleration (3,) of the origin of the body in world axes, z up.
-    """
+    """Returns the true [angular rate, R' (a + g z)] (6,) in body axes [rad/s, m/s2], of the body's origin."""
+    # R: rotation (3, 3) world_from_body, a: acceleration (3,) of the origin of the body in world axes, z up
     return np.concatenate([rate_radps, rotation.T @ (acceleration_mps2 + [0.0, 0.0, GRAVITY_MPS2])])
 
 

@@ -40,10 +40,8 @@ NO_TETHER = tether_of(TetherConfig(), np.zeros(3))
 
 
 def steady_pulls(tether: Tether, current_mps: Array, position_m: Array, yaw: Array, velocity_mps: Array) -> Array:
-    """Returns the wrenches (n, 6) [moment, force] of a tether on a level vehicle in the body [N m, N].
-
-    In a current (3,), at positions (n, 3), yaws (n,) [rad] and velocities (n, 3) in the world.
-    """
+    """Returns the wrenches (n, 6) [N m, N] of a tether on a level vehicle, in the body."""
+    # in a current (3,), at positions (n, 3), yaws (n,) [rad] and velocities (n, 3) in the world
     wrenches, sea, zero = np.zeros((len(yaw), 6)), steady_current(current_mps), np.zeros(3)
     for k in range(len(yaw) if tether.length_m else 0):
         c, s, moving = np.cos(yaw[k]), np.sin(yaw[k]), np.concatenate([velocity_mps[k], zero])
@@ -54,11 +52,8 @@ def steady_pulls(tether: Tether, current_mps: Array, position_m: Array, yaw: Arr
 
 @kernel
 def add_tether(wrench, tether, sea, time_s, world_from_body, position, velocity):
-    """Adds the pull of the tether to a wrench (6,) [moment, force] in body axes [N m, N].
-
-    At a rotation (3, 3) and a position (3,) of the centre of gravity, with a velocity (6,) in the coordinates of a free
-    joint: [linear in the world, angular in the body].
-    """
+    """Adds the pull of the tether to a wrench (6,) [moment, force] in body axes [N m, N]."""
+    # at a rotation (3, 3) and position (3,) of the centre of gravity; velocity (6,): [linear in world, angular in body]
     if tether.length_m == 0.0 and tether.snag[0] == 0.0:
         return
     a, turning = tether.attachment_m, velocity[3:]

@@ -42,10 +42,7 @@ class ThrusterState(NamedTuple):
 
 
 def lagged_thrusters(vehicle: VehicleParameters, timestep_s: float) -> ThrusterState:
-    """Returns the thrusters of a vehicle at rest: the thrust of each follows its steady thrust with a linear lag.
-
-    Exact for commands that are constant over a timestep (zero-order hold).
-    """
+    """Returns thrusters at rest that follow their steady thrust with a linear lag, exact for a zero-order hold."""
     numerator, denominator = vehicle.thruster_lag
     a, b = _zero_order_hold(denominator, timestep_s)
     c = np.zeros(len(a))
@@ -87,10 +84,8 @@ def thruster_wrench(thrusters):
 
 
 def _zero_order_hold(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
-    """Returns the discrete matrices of the transfer function 1 / denominator, for an input constant over a timestep dt.
-
-    They are the first n rows of exp([[A, B], [0, 0]] dt), with A and B its controllable canonical form (Van Loan 1978).
-    """
+    """Returns the discrete matrices of 1 / denominator for an input that is constant over a timestep dt."""
+    # the first n rows of exp([[A, B], [0, 0]] dt), in controllable canonical form (Van Loan 1978)
     n = len(denominator) - 1
     rates = np.zeros((n + 1, n + 1))
     rates[0, :n], rates[0, n] = -denominator[1:], 1.0

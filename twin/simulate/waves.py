@@ -84,10 +84,8 @@ def jonswap(waves: WavesConfig, omega: Array) -> Array:
 
 
 def significant_height_m(waves: WavesConfig) -> float:
-    """Returns four standard deviations of the surface elevation; with wind U and fetch F, 0.0016 U sqrt(F / g).
-
-    This is the fit of Hasselmann et al. (1973) to measured variances; their fit of alpha gives 1.27 times this height.
-    """
+    """Returns four standard deviations of the surface elevation; with wind U and fetch F, 0.0016 U sqrt(F / g)."""
+    # the fit of Hasselmann et al. (1973) to measured variances; their fit of alpha gives 1.27 times this height
     if waves.wind_mps is None or waves.fetch_m is None:
         return waves.height_m
     return 0.0016 * waves.wind_mps * math.sqrt(waves.fetch_m / GRAVITY_MPS2)

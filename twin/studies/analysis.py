@@ -25,7 +25,7 @@ from twin.studies.answers import (
     range_text,
     regress,
 )
-from twin.studies.passing_map import PassingMap, passing_map
+from twin.studies.monotone import PassingMap, passing_map
 from twin.studies.statistics import UNDEFINED, Array, Interval, Proportion, SobolIndex
 from twin.studies.study_file import FIDELITY, Study
 
@@ -209,10 +209,8 @@ class StudyAnalysis:
 
     @cached_property
     def sobol(self) -> dict[str, dict[str, SobolIndex]]:
-        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes.
-
-        A metric is left out if it is constant, or if a survey of the design is not complete or has no value of it.
-        """
+        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes."""
+        # without metrics that are constant, or of which a survey of the design has no value
         sampling, keys = self.study.sampling, self.study.axes(listed=False)
         axes = [name if isinstance(name, str) else " + ".join(name) for name in keys]
         usable = sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1

@@ -36,10 +36,7 @@ class Answer(NamedTuple):
 
 
 class KeyLimit(NamedTuple):
-    """Value of a key at which the pass probability crosses the required one, with its 95 % confidence interval.
-
-    A number is infinite if it lies beyond the flown values.
-    """
+    """Value where the pass probability crosses the required one, and 95 % interval; infinite beyond flown values."""
 
     value: float  #: NaN if it depends on the unknown results
     low: float
@@ -153,10 +150,8 @@ def answers_of_ranges(regression: KeyRegression) -> list[Answer]:
 
 
 def limit_of_key(regression: KeyRegression, answers: list[Answer]) -> KeyLimit | None:
-    """Returns the limit of a key, given its answers; None unless the pass probability only rises, or falls, with it.
-
-    The interval extends from the end of the range that passes to that of the range that fails.
-    """
+    """Returns the limit of a key, given its answers; None unless the pass probability only rises, or falls, with it."""
+    # The interval extends from the end of the range that passes to that of the range that fails.
     if [len(pieces) for pieces in regression.worst] != [1]:
         return None
     curves = [pieces[0][1] for pieces in (regression.worst[0], regression.best[0])]
@@ -169,10 +164,7 @@ def limit_of_key(regression: KeyRegression, answers: list[Answer]) -> KeyLimit |
 
 
 def _shown(regression: KeyRegression, reached: bool) -> NDArray[np.int64]:
-    """Returns 1 for surveys (n,) at whose value every regression shows the required probability, or a smaller one.
-
-    To be reached, it must be shown at worst; to be missed, at best. Without a regression, 1 for all.
-    """
+    """Returns 1 for surveys (n,) where every regression shows the probability, reached at worst or missed at best."""
     shown, required = np.ones(len(regression.x), bool), regression.record.required
     for pieces in regression.worst if reached else regression.best:
         part = np.zeros(len(regression.x), bool)
@@ -213,11 +205,9 @@ def monotone_pieces(x: Array, passed: Mask) -> list[tuple[Mask, bool]]:
 
 
 def _changes(x: Array, passed: Mask, least: float = _INFLUENCE_DEVIANCE) -> list[float]:
-    """Returns the values in x (n,), ascending, at which the fraction that passed changes.
-
-    The surveys are divided where this reduces the binomial deviance most, if by `least` or more, and both parts
-    likewise, if by `_TURNING_DEVIANCE`, as in a classification tree (Breiman et al. 1984).
-    """
+    """Returns the values in x (n,), ascending, at which the fraction that passed changes."""
+    # divided where it reduces the binomial deviance most, if by `least`, and both parts likewise, if by
+    # `_TURNING_DEVIANCE`, as in a classification tree (Breiman et al. 1984)
     n, passes = np.arange(1, len(x) + 1), np.cumsum(passed)
     gain = _deviance(passes[-1], n[-1]) - _deviance(passes, n)[:-1] - _deviance(passes[-1] - passes, n[-1] - n)[:-1]
     gain[np.diff(x) == 0] = 0.0  # equal values stay together

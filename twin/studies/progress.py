@@ -22,10 +22,7 @@ _INTERVAL_S = 60.0  # between two lines where there is no terminal
 
 
 class StudyProgress:
-    """Display of finished, failed and refused surveys, pass probability and time left.
-
-    `end_s` is the time [s since the epoch] at which the surveys are stopped.
-    """
+    """Display of finished, failed, refused surveys, pass probability and time to `end_s` [s since the epoch]."""
 
     def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False, end_s: float = math.inf):
         self.total, self.ended = 0, Counter[str]()

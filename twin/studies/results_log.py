@@ -20,10 +20,7 @@ _CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionari
 
 
 class ResultsLog:
-    """Log of the results in the file rows.jsonl: one row per line; a survey's last row supersedes its earlier rows.
-
-    Rows that cannot be written, e.g. because the disk is full, stay in memory and are written with the next row.
-    """
+    """Log in rows.jsonl, one row per line, the last of a survey counts; unwritten rows (full disk) follow later."""
 
     def __init__(self, folder: Path):
         self.file = folder / "rows.jsonl"

@@ -15,11 +15,8 @@ _DURATION = re.compile(r"(\d+(?:\.\d*)?)\s*([a-z]+)")
 
 
 def rendered_time(rows: Iterable[Row], scenario: Scenario, simulated_s: float) -> tuple[float, str]:
-    """Returns the expected run time of a rendered survey on one CPU core [s], and how it was found.
-
-    It is the simulated duration of the survey [s], times the run time per simulated second in the rendered surveys
-    among the rows or, without one, as estimated from frame rate and image size.
-    """
+    """Returns the expected run time of a rendered survey on one CPU core [s], and how it was found."""
+    # simulated duration times that per simulated second in rendered rows, or as by frame rate and image size
     run_s = flown_s = 0.0
     for row in rows:
         if row.get("fidelity") == "rendered" and row.get("timing.simulated_s"):

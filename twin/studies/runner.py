@@ -117,10 +117,7 @@ def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet, render_ref
 
 
 def _render_refused(study: Study, folder: Path, log: ResultsLog, fleet: Fleet, add_row: Callable[[Row], None]) -> bool:
-    """Flies rendered what only the surrogate refused, after the time it takes; returns False if interrupted by Ctrl-C.
-
-    The row of a survey keeps its scenario hash, that of the study. A survey that fails stays unknown.
-    """
+    """Flies rendered what only the surrogate refused, keeping scenario hashes; False if interrupted by Ctrl-C."""
     rows = {key_of(row): row for row in log.rows()}
     refused = {key: row["scenario_hash"] for key, row in rows.items() if row.get("unmodelled")}
     if not refused:

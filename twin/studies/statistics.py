@@ -175,11 +175,8 @@ def bootstrap_interval(
 def bootstrap_with_unknown(
     values: Array, statistic: Callable[[Array], Array], clusters: NDArray[Any], unknown_clusters: NDArray[Any]
 ) -> Interval:
-    """Returns `bootstrap_interval` if further values, given by their clusters (m,), may be anything.
-
-    Its ends are those with the further values as small, and as large, as possible; an end may be infinite. The value is
-    that of the known data.
-    """
+    """Returns `bootstrap_interval` of known data if further values, of clusters (m,), may be anything."""
+    # ends with them as small, and as large, as possible; an end may be infinite
     known = bootstrap_interval(values, statistic, clusters)
     if len(unknown_clusters) == 0 or len(values) == 0:
         return known

@@ -94,10 +94,7 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
 
 
 def _draw_regression(axes: Axes, regression: KeyRegression) -> None:
-    """Plots surveys as ticks at 0, 1/2 (unknown) and 1, and the monotone regression.
-
-    The regression is drawn twice if results are unknown: all of them not passed, and all passed.
-    """
+    """Plots surveys at 0, 1/2 (unknown) and 1, and the regression, twice (at worst, at best) if any is unknown."""
     x, record = regression.x, regression.record
     axes.axhline(float(record.passed.mean()), color=COLOURS["reference"], linestyle="--", linewidth=1)
     for _, curve in chain(*regression.worst[:1], *regression.best[-1:]):

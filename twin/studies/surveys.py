@@ -27,10 +27,7 @@ class Sample(NamedTuple):
 
 
 def samples(study: Study) -> Iterator[Sample]:
-    """Yields the samples of a study: each design point combined with every cell of the grids.
-
-    With the methods "random" and "sobol", the first samples stay the same if the number of samples is increased.
-    """
+    """Yields each design point with every cell of the grids; more samples keep the first ("random", "sobol")."""
     sampled, listed, plan = study.axes(listed=False), study.axes(listed=True), study.sampling
     points = design_points(plan.method, plan.samples or 1, len(sampled), plan.seed)
     columns = [law.quantiles(points[:, k]) for k, law in enumerate(sampled.values())]
@@ -50,11 +47,8 @@ def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
 
 
 def design_points(method: SamplingMethod, n_points: int, n_axes: int, seed: int) -> Array:
-    """Returns points (n, n_axes) in the unit cube; n is n_points, with "saltelli" n_points (n_axes + 2).
-
-    Saltelli's design (2010, Comput. Phys. Commun. 181, 259) stacks blocks A, B and, for each axis, A with the column
-    of this axis from B.
-    """
+    """Returns points (n, n_axes) in the unit cube; n is n_points, with "saltelli" n_points (n_axes + 2)."""
+    # Saltelli's design (2010, Comput. Phys. Commun. 181, 259): blocks A, B and, for each axis, A with its column from B
     from scipy.stats import qmc  # the import takes a second, and workers do not need it
 
     rng = np.random.default_rng([seed, _DESIGN_STREAM])
@@ -84,10 +78,7 @@ class Survey(NamedTuple):
 
 
 class SampleSource(Source):
-    """Source of a sample's scenario: locates an error in it at the line of the study file that sets the faulty key.
-
-    An error in another key is located at the line of the key `scenario`.
-    """
+    """Source of a sample's scenario: errors are at the line of the study file that sets the key, else of `scenario`."""
 
     sample: int
     given: dict[str, str]  #: for each scenario key, its dotted name in the study file
@@ -105,10 +96,7 @@ class SampleSource(Source):
 
 
 def surveys(study: Study, folder: Path, without: Container[int] = (), shuffled: bool = False) -> Iterator[Survey]:
-    """Yields every survey of the study, sample by sample; raises ScenarioError if that of a sample is not valid.
-
-    If `shuffled`, the samples come in random order, so that the first of them represent all.
-    """
+    """Yields every survey, by sample, or `shuffled` (the first represent all); ScenarioError if one is not valid."""
     base, planned = read_tree(study.scenario_file), samples(study)
     if shuffled:
         in_order = list(planned)

@@ -287,11 +287,8 @@ def _finite(objective: str, value: float | None) -> float:
 
 
 def median_of(scores: list[SurveyScore], name: str) -> float | None:
-    """Returns the median of a metric over the complete surveys; None if none has a value.
-
-    A missing value counts as infinite for a metric of `INFINITE_WITH_HOLES`, and an unknown one as the worst, except
-    for a duration.
-    """
+    """Returns the median of a metric over the complete surveys; None if none has a value."""
+    # missing: infinite for `INFINITE_WITH_HOLES`; unknown: the worst, except for a duration
     complete = [score.metrics[name] for score in scores if score.status == "complete"]
     known = [np.inf if value is None and name in INFINITE_WITH_HOLES else value for value in complete]
     known = [value for value in known if value is not None]

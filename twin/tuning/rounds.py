@@ -208,11 +208,9 @@ class Tuning:
             self.plans |= search.finished()
 
     def _verify_front(self, search_round: int) -> None:
-        """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
-
-        Repeats this until that plan was verified before, none is confirmed, or `config.plans` plans were verified. If
-        the surrogate confirms none because it refuses some conditions, plans that may pass in these are verified.
-        """
+        """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans."""
+        # until it was verified before, none is confirmed, or `config.plans` were; plans that may pass are verified if
+        # the surrogate confirms none because it refuses some conditions
         for _ in range(self.config.plans):
             self.confirmed = self._cheapest_confirmed()
             chosen = self.confirmed or self._cheapest_possible()
@@ -238,11 +236,9 @@ class Tuning:
                 return
 
     def _next_cheaper(self) -> Candidate | None:
-        """Returns the next plan to verify that is cheaper than the recommended one; None if there is none.
-
-        The costs of all plans are the corrected results of the search. Of the cheaper plans that no other dominates and
-        that are not verified, it has the smallest shortfall of the pass probability and, of those, the highest cost.
-        """
+        """Returns the next plan to verify that is cheaper than the recommended one; None if there is none."""
+        # by corrected costs, of plans that none dominates: the smallest shortfall of the pass probability, then the
+        # highest cost
         if (chosen := self.recommended) is None:
             return None
 
@@ -260,10 +256,7 @@ class Tuning:
         self.start = self._verification(self.confirmation.evaluate(START, values), 0, _START_SURVEYS)
 
     def _verify(self, plan: Candidate, search_round: int) -> None:
-        """Flies rendered surveys of a plan until they show the required pass probability, or cannot show it any more.
-
-        What a search that ends before has flown counts as well.
-        """
+        """Flies rendered surveys of a plan until they show the pass probability or cannot; also of an ended one."""
         found, count = self._verification(plan, search_round, 0), 0
         self._announce(plan, found)
         while (further := found.next_surveys()) > count:

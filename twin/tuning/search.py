@@ -60,11 +60,8 @@ class Search:
         self.optuna_study.set_user_attr("scenario", fingerprint)
 
     def add_earlier_candidates(self, candidates: Iterable[tuple[dict[str, Any], Sequence[float], float]]) -> None:
-        """Adds (values of the searched keys, objectives, shortfall) of the candidates of earlier rounds.
-
-        Does nothing once this round has candidates of its own. If an interrupted search added some of the candidates,
-        which have the same order at every call, adds the others.
-        """
+        """Adds earlier rounds' (values of searched keys, objectives, shortfall), unless this round has its own."""
+        # those that an interrupted search has not added; they have the same order at every call
         known = self._trials()
         if any(_EARLIER not in trial.user_attrs for trial in known):
             return

@@ -47,10 +47,7 @@ class Verification(NamedTuple):
         return not self.shown and n_missed > 0 and self.needed > self.most
 
     def next_surveys(self) -> int:
-        """Returns the number of rendered surveys to fly before this is looked at again; 0 if that is the end.
-
-        The number doubles, so that a bad plan costs little, up to the needed one.
-        """
+        """Returns the number of rendered surveys to fly next: it doubles up to the needed one; 0 if that is the end."""
         if self.shown or self.rejected:
             return 0
         return int(min(max(_FIRST_SURVEYS, 2 * self.surveys), self.needed, self.most))

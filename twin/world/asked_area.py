@@ -99,10 +99,8 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
 
 
 def _contour_heading(area: SurveyArea, terrain: Terrain) -> float:
-    """Returns the direction of the contours of the plane that fits the floor of an area best, -pi/2 to pi/2 [rad].
-
-    The plane is fitted to the known nodes of the terrain in the area; 0 if they are fewer than three, or level.
-    """
+    """Returns the direction of the contours of the plane fitted to the floor of an area, -pi/2 to pi/2 [rad]."""
+    # 0 if fewer than three nodes are known, or level
     known = np.ones(terrain.height_m.shape, np.bool_) if terrain.known is None else terrain.known
     rows, cols = np.nonzero(known)
     x, y = terrain.west_m + cols * terrain.spacing_m, terrain.south_m + rows * terrain.spacing_m

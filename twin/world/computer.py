@@ -12,11 +12,7 @@ _FRAME_S, _KEYFRAME_S, _PIXELS = 0.0017, 0.0823, 320 * 240
 
 
 def latency_s(scenario: Scenario) -> float:
-    """Returns the latency [s]: the stated one, or for "stated" the time of the estimators for a keyframe.
-
-    The command waits for the slowest frame, so that the latency is constant. Times are proportional to the number of
-    pixels.
-    """
+    """Returns the stated latency [s] or, for "stated", the longest time of the estimators (by pixels), a constant."""
     latency = scenario.control.latency
     if latency == "stated":
         return math.fsum(_times_s(scenario))

@@ -120,11 +120,10 @@ class FloorFollower:
 
 
 class EchoCorrection:
-    """Height of the floor below an altimeter that returns the nearest echo in its beam, which comes from upslope.
+    """Height of the floor below an altimeter that returns the nearest echo in its beam, from upslope."""
 
-    A plane of gradient g is h / (cos a + |g| sin a) away at the edge of a beam of half-width a. |g| is the mean over
-    the floor so far, with slopes alike in all directions: sqrt(pi / 2) times the RMS of those along the path.
-    """
+    # A plane of gradient g is h / (cos a + |g| sin a) away at the edge of a beam of half-width a. |g| is the mean over
+    # the floor so far, with slopes alike in all directions: sqrt(pi / 2) times the RMS of those along the path.
 
     def __init__(self, beam_deg: float):
         self._half = np.deg2rad(beam_deg / 2)

@@ -17,10 +17,7 @@ _SAMPLES = 50  # of the floor along a leg
 
 
 class GapFiller:
-    """Counts the keyframes with stereo points in each cell of the area, and plans legs over the gaps.
-
-    The points are at the online poses; what they do not show, such as shadows of objects, is a gap if it fills a cell.
-    """
+    """Counts the keyframes with stereo points (at online poses) in each cell of the area; plans legs over gaps."""
 
     def __init__(self, mission: Mission):
         plan, chart = mission.plan, mission.chart

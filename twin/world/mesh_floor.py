@@ -102,10 +102,8 @@ def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
 
 
 def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
-    """Returns the grid whose cell centres are the nodes of the height grid, centred at the origin as the mesh is.
-
-    The spacing is the median edge length, at least FINEST_GRID_M, at most `coarsest_m`, or as MOST_NODES requires.
-    """
+    """Returns the grid whose cell centres are the nodes of the height grid, centred at the origin as the mesh is."""
+    # spacing: the median edge length, at least FINEST_GRID_M, at most `coarsest_m`, or as MOST_NODES requires
     low, high = extent(mesh)
     size = (high - low)[:2]
     wanted_m = min(max(median_edge_m(mesh), FINEST_GRID_M), coarsest_m)

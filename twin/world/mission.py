@@ -189,10 +189,7 @@ class Mission:
         return FrameSequence(self.plan.references(track, times_s), keyframes, False, times_s, track)
 
     def station_keeping_frames(self, track: int, half: int = 0) -> FrameSequence:
-        """Returns the planned frames of a half (0 or 1) of the station keeping after a track; between them, GA runs.
-
-        A vehicle that flies arcs goes on straight ahead.
-        """
+        """Returns the frames of a half (0, 1) of the station keeping; a vehicle that flies arcs goes straight on."""
         n, times_s = self._n_holding, np.full(self._n_holding, self.plan.track_duration_s(track))
         if self.plan.flies_arcs:
             times_s -= (FRAMES_BETWEEN_TRACKS - half * n - np.arange(n)) / self.plan.request.frame_rate_hz
@@ -200,10 +197,8 @@ class Mission:
         return FrameSequence(self.plan.references(track, times_s), np.zeros(n, np.bool_), holding, times_s, track)
 
     def next_frames(self, track: int, path_time_s: float, pace: Pace) -> FrameSequence:
-        """Returns the frames of a track after a path time at a pace: the next one, or all that remain at full pace.
-
-        Every planned keyframe is flown, at the first frame at or after its path time.
-        """
+        """Returns the frames of a track after a path time: the next one, or at full pace all that remain."""
+        # every planned keyframe is flown, at the first frame at or after its path time
         planned_s, planned_keyframes = self.plan.frames_of_track(track)
         times_s = pace.path_times(path_time_s, float(planned_s[-1]), 1 / self.plan.request.frame_rate_hz)
         reference = pace.scaled(self.plan.references(track, times_s))

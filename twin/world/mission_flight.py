@@ -83,10 +83,8 @@ class Flight:
         return self._step.holding
 
     def follow(self, surface: CameraSurface) -> None:
-        """Lets the camera follow another surface after this frame, without a step of height or vertical velocity.
-
-        A vehicle that keeps station keeps its height.
-        """
+        """Lets the camera follow another surface after this frame, without a step of height or vertical velocity."""
+        # a vehicle that keeps station keeps its height
         self._change_path(self._mission.above(surface), self._change.offset_m)
 
     def shift(self, offset_m: Array) -> None:
@@ -154,10 +152,8 @@ class Flight:
         return Pace(self._factor * pace.rate, change_per_s, pace.keyframe)
 
     def _next_part(self) -> tuple[FrameSequence, bool] | None:
-        """Returns the next planned sequence, with the value of `aligns` at its first frame; None after the last one.
-
-        The sequences of a track are its path and the two halves of the station keeping after it.
-        """
+        """Returns the next planned sequence, with `aligns` at its first frame; None after the last one."""
+        # of a track: its path, and the two halves of the station keeping after it
         track, part = self._n_parts // 3 + 1, self._n_parts % 3
         if track > self._mission.plan.n_tracks:
             plan = self._mission.plan

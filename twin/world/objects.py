@@ -1,26 +1,31 @@
 """Objects of a scenario: loaded or built, and placed on the floor."""
 
+import os
+import pickle
 import zlib
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
 from twin import terrains
 from twin.errors import TwinError
+from twin.kernels import cache_folder
 from twin.scenario.model import ObjectConfig, Scenario
-from twin.terrains.objects.built_models import built_model
 from twin.terrains.objects.mesh_file import read_mesh
 from twin.terrains.objects.placed_object import ObjectModel, PlacedObject, grown, model_of
 from twin.terrains.objects.scattering import check_inside, place
-from twin.terrains.objects.shapes import SHAPES
+from twin.terrains.objects.shapes import SHAPES, build_shape
 from twin.world.scenario_checks import keys_without_effect
 
 GREY = (0.4, 0.4, 0.4)  #: albedo of a mesh without colours
 SHAPE_SIZE_M = 0.4  #: size of a built-in shape without `size_m`
 MAX_FACES = 8_000_000  #: largest number of triangles of all built-in shapes and mesh files together
 MAX_OBJECTS = 20_000
+_MOST_KEPT = 96  #: built models on disk; those written first are removed
 
 Attempt = Callable[[Callable[[], object]], object]
 
@@ -128,3 +133,29 @@ def _check_keys(path: str, config: ObjectConfig) -> None:
     if config.shape == "pipe" and config.width_m and _pipe_width(config) > 1:
         allowed = f"up to {config.size_m or SHAPE_SIZE_M:g}"
         raise TwinError(f"{path}.width_m", f"{config.width_m:g}: wider than long", allowed)
+
+
+def built_model(
+    shape: str, albedo: tuple[float, float, float] | None, seed: np.random.SeedSequence, **form: float
+) -> ObjectModel:
+    """Returns the model of a built-in shape (`build_shape`), from disk if it was built before: a reef takes seconds."""
+    key = repr((np.__version__, shape, albedo, seed.entropy, seed.spawn_key, sorted(form.items())))
+
+    def build() -> ObjectModel:
+        return model_of(build_shape(shape, albedo, np.random.default_rng(seed), **form), SHAPES[shape].sways)
+
+    folder = cache_folder(Path(__file__).resolve(), __name__)
+    return build() if folder is None else _kept(folder / f"{sha256(key.encode()).hexdigest()[:32]}.pickle", build)
+
+
+def _kept(file: Path, build: Callable[[], ObjectModel]) -> ObjectModel:
+    """Returns the object in a file; builds and writes it if there is none, or if it is damaged."""
+    with suppress(OSError, EOFError, ValueError, pickle.UnpicklingError):
+        return pickle.loads(file.read_bytes())
+    model, part = build(), file.with_suffix(f".{os.getpid()}.part")
+    with suppress(OSError):  # of a full disk
+        part.write_bytes(pickle.dumps(model, pickle.HIGHEST_PROTOCOL))
+        part.replace(file)
+        for old in sorted(file.parent.glob("*.pickle"), key=lambda kept: kept.stat().st_mtime)[:-_MOST_KEPT]:
+            old.unlink()
+    return model

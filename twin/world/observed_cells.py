@@ -74,10 +74,8 @@ def _mark_seen(seen, raster, pose, camera, left, right, top):
 
 @kernel
 def _in_both(u, v, left, right, camera):
-    """Returns whether both cameras see the floor point at pixel (u, v) of the left image.
-
-    Its depth must lie between those of the two right pixels next to its projection, within DEPTH_TOLERANCE.
-    """
+    """Returns whether both cameras see the floor point at pixel (u, v) of the left image."""
+    # between the depths of the two right pixels next to its projection, within DEPTH_TOLERANCE
     z = left[v, u]
     if not (z > 0 and z < np.inf):
         return False
@@ -107,10 +105,8 @@ def _is_surface(left, u, v):
 
 @kernel
 def _mark_triangle(seen, top, slack, a, b, c):
-    """Marks the cells whose centre lies inside or on the edge of a triangle with corners (column, row, height).
-
-    With `top`, only where it is at most `slack` [m] below it; a triangle without area then marks no cell.
-    """
+    """Marks the cells whose centre lies in a triangle with corners (column, row, height), or on its edge."""
+    # with `top`, only where it is at most `slack` [m] below it; a triangle without area then marks no cell
     row0, col0 = max(0, int(np.ceil(min(a[1], b[1], c[1])))), max(0, int(np.ceil(min(a[0], b[0], c[0]))))
     row1 = min(seen.shape[0] - 1, int(np.floor(max(a[1], b[1], c[1]))))
     col1 = min(seen.shape[1] - 1, int(np.floor(max(a[0], b[0], c[0]))))

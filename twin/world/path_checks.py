@@ -91,12 +91,9 @@ def check_places_of_faults(faults: Sequence[FaultConfig], plan: SurveyPlan) -> N
 
 
 def _clearance(plan: SurveyPlan, asked: PlanConfig, terrain: Terrain) -> Clearance:
-    """Returns the least clearance of the planned path.
-
-    A level path must be clear of the floor in its images and between its swaths; a path that follows the floor, of the
-    floor within VEHICLE_REACH_M and `plan.clearance_m` of the cameras horizontally: beside a wall, images may show
-    floor that is higher than the cameras. Its position is that of the camera.
-    """
+    """Returns the least clearance of the planned path, and the position of the camera there."""
+    # A level path must be clear of the floor in its images and between its swaths; one that follows the floor, of that
+    # within VEHICLE_REACH_M and `plan.clearance_m`: beside a wall, images may show higher floor than the cameras.
     if not plan.follows_floor:
         return least_clearance(plan, terrain.height_at)
     x, y, z = plan.all_references().position.T
@@ -118,10 +115,8 @@ def room_below_m(plan: SurveyPlan, asked: PlanConfig, chart: Terrain, top: Terra
 
 
 def highest_near(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array:
-    """Returns the height (n,) of the highest floor within a horizontal distance of each of n points.
-
-    From the nodes in three rectangles that together nearly fill the circle, and from points on it.
-    """
+    """Returns the height (n,) of the highest floor within a horizontal distance of each of n points."""
+    # by the nodes in three rectangles that together nearly fill the circle, and points on it
     rows, cols = _nodes(terrain, x_m, y_m)
     rows, cols = (np.clip(k, 0, n - 1) for k, n in zip((rows, cols), terrain.height_m.shape, strict=True))
     highest = terrain.height_near(x_m, y_m)
@@ -189,11 +184,9 @@ def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
 
 
 def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
-    """Raises TwinError if the vehicle comes too close to an object on its planned path.
-
-    The highest corner of its bounding box must be at least `clearance_m` below the cameras where their horizontal
-    distance to the circle around this box is less than VEHICLE_REACH_M.
-    """
+    """Raises TwinError if the vehicle comes too close to an object on its planned path."""
+    # the highest corner of its bounding box, less than `clearance_m` below the cameras within VEHICLE_REACH_M of its
+    # circle
     path = plan.all_references().position if objects else np.empty((0, 3))
     for item in objects:
         disc, top_m = disc_of(item), item.corners_m()[:, 2].max()

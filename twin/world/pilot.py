@@ -19,7 +19,7 @@ from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import CONTROLLERS
 from twin.plugin.protocols import Adaptation, ControllerSetup, Situation
 from twin.simulate.autopilot import allocation_without, nominal_controller, thruster_lag_s
-from twin.simulate.fin_control import fin_autopilot
+from twin.simulate.fin_autopilot import fin_autopilot
 from twin.simulate.parameters import moves_along_all_axes
 from twin.world.computer import frames_of_latency
 from twin.world.mission import Mission
@@ -39,14 +39,14 @@ def make_pilot(mission: Mission, monitor: ThrusterMonitor | None = None) -> Pilo
     The thrusters that `monitor` finds lost are left out; a plug-in is not told of them.
     """
     scenario = mission.scenario
-    n_late = frames_of_latency(mission.scenario)
+    n_late = frames_of_latency(scenario)
     if scenario.control.plugin is not None:
         return PluginPilot(mission, scenario.control.plugin)
     if scenario.vehicle.is_steered_by_fins:
         return _late(AuvPilot(mission), n_late)
-    return (
-        RovPilot(mission, monitor) if scenario.vehicle.dynamics == "rigid" else _late(_kinematic_pilot(mission), n_late)
-    )
+    if scenario.vehicle.dynamics == "rigid":
+        return RovPilot(mission, monitor)
+    return _late(partial(_kinematic_command, scenario.control.natural_frequency_radps), n_late)
 
 
 def _late(pilot: PilotOfEstimates, n: int) -> PilotOfEstimates:
@@ -110,10 +110,6 @@ class PluginPilot:
         return Adaptation(numbers("adapt", asked.offset_m, (3,)), float(numbers("adapt", asked.pace, ())))
 
 
-def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
-    return partial(_kinematic_command, mission.scenario.control.natural_frequency_radps)
-
-
 def _kinematic_command(frequency: float, estimate: Estimate, reference: Reference) -> Array:
     return commanded_velocity(estimate.world_from_camera[:3, 3], reference, frequency)
 
@@ -132,10 +128,7 @@ class PilotState(NamedTuple):
 
 
 class AuvPilot:
-    """Pilot of a vehicle that is steered by fins; a command (n,) in [-1, 1] per thruster, then per movable fin.
-
-    With a latency, pose and reference are predicted to the time at which the command takes effect.
-    """
+    """Pilot of a vehicle with fins; a command (n,) in [-1, 1] per thruster, then movable fin, after the latency."""
 
     def __init__(self, mission: Mission):
         rig, scenario = mission.rig, mission.scenario
@@ -167,10 +160,7 @@ class AuvPilot:
 
 
 class RovPilot:
-    """Pilot of the ROV; a command (n,) has one value in [-1, 1] per thruster.
-
-    It leaves out the thrusters that `monitor` finds lost; a call raises SurveyAborted if the others do not suffice.
-    """
+    """Pilot of the ROV; a command (n,) in [-1, 1] per thruster, without lost ones; SurveyAborted if too many are."""
 
     def __init__(self, mission: Mission, monitor: ThrusterMonitor | None = None):
         self._vehicle, self._monitor, self._n_lost = mission.scenario.vehicle, monitor, 0
@@ -214,10 +204,8 @@ class RovPilot:
 
 @kernel
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw, is_measured=True):
-    """Returns the thruster commands (n,) and updates `state` in place; compiled kernel of `RovPilot`.
-
-    With a latency, pose and reference are predicted to the time at which the command reaches the thrusters.
-    """
+    """Returns the thruster commands (n,) and updates `state` in place; compiled kernel of `RovPilot`."""
+    # With a latency, pose and reference are predicted to the time at which the command reaches the thrusters.
     change = state.body_from_camera_twist @ camera_velocity - state.twist
     geometry.copy_into(state.twist, state.twist + state.smoothing * change)
     body = geometry.compose(world_from_camera, state.camera_from_body)

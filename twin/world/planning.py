@@ -107,11 +107,8 @@ def level_plan(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
 
 
 def for_slopes(request: SurveyRequest) -> SurveyRequest:
-    """Returns the request with the spacing that keeps the overlaps over slopes of `UNKNOWN_SLOPE`.
-
-    At the slope g, the floor that rises reaches 1 / (1 + g t) as far into an image as level floor, with t the tangent
-    of half the angle of view (`_leg_spacing`).
-    """
+    """Returns the request with the spacing that keeps the overlaps over slopes of `UNKNOWN_SLOPE`."""
+    # At the slope g, the floor that rises reaches 1 / (1 + g t) as far into an image as level floor (`_leg_spacing`).
     across, along = (1 / (1 + UNKNOWN_SLOPE * side / 2 / request.altitude_m) for side in request.footprint_m)
     return request._replace(across_scale=across, along_scale=along)
 
@@ -198,11 +195,8 @@ def climb_slopes(scenario: Scenario) -> tuple[float, float]:
 
 
 def _over_floor(plan: SurveyPlan, pattern: str, terrain: Terrain, rig: StereoRig) -> SurveyPlan:
-    """Returns the plan of the same survey with the spacing that keeps the required overlap over the floor.
-
-    Legs are equally spaced unless fewer tracks fill the area if they are nearer to each other where the camera is
-    nearer to the floor. Raises TwinError if no spacing keeps the overlap.
-    """
+    """Returns the plan with the spacing that keeps the overlap over the floor; TwinError if none does."""
+    # Legs are equally spaced unless fewer tracks fill the area if they are nearer to each other over high floor.
     make, field, spacings = _PATTERNS[pattern], floor_of(terrain), [_EQUAL]
     if pattern == "lawnmower":
         spacings.append(_leg_spacing(plan, terrain))
@@ -220,12 +214,9 @@ def _over_floor(plan: SurveyPlan, pattern: str, terrain: Terrain, rig: StereoRig
 
 
 def _leg_spacing(plan: SurveyPlan, terrain: Terrain) -> tuple[tuple[float, float], ...]:
-    """Returns pairs of v [m] and the extent across the legs of images there, relative to that over the plane.
-
-    At a height h above a floor with the slope g across the legs, the floor that rises reaches h t / (1 + g t) into an
-    image, with t the tangent of half the angle of view. The floor is averaged over half an image, and the extent is the
-    SHORT_PERCENT percentile along the legs.
-    """
+    """Returns pairs of v [m] and the extent across the legs of images there, relative to that over the plane."""
+    # At a height h above a floor with the slope g across the legs, the floor that rises reaches h t / (1 + g t) into an
+    # image, with t the tangent of half the angle of view. Floor averaged over half an image, SHORT_PERCENT percentile.
     request, area = plan.request, plan.area
     half_m = request.footprint_m[0] / 2
     reach_m = [side / 2 + half_m for side in area.size_m]
@@ -249,11 +240,9 @@ def _leg_spacing(plan: SurveyPlan, terrain: Terrain) -> tuple[tuple[float, float
 def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig: StereoRig) -> SurveyRequest:
     """Returns the request with `along_scale` and `across_scale` reduced until the overlap over the floor suffices.
 
-    It suffices if all but SHORT_PERCENT of the pairs of keyframes, along and across the swaths, have at least the
-    smaller of two overlaps: the required one, and the one that all but SHORT_PERCENT have over the reference plane with
-    scales of 1. The scales start at 1 and are multiplied by allowed / found of 1 - overlap (0.3 to 0.99). Frames per
-    keyframe and tracks are integers, so a small step may leave them unchanged: the least step of 1 % is doubled after
-    each step without effect.
+    It suffices if all but SHORT_PERCENT of the pairs of keyframes, along and across the swaths, have the required
+    overlap or that which all but SHORT_PERCENT have over the reference plane with scales of 1. Scales are multiplied by
+    allowed / found of 1 - overlap (0.3 to 0.99); the least step of 1 % is doubled after each without effect (integers).
     """
     make = _PATTERNS[pattern]
     rough_tracks = max(request.area_m) / make(request._replace(tracks=1)).swath_spacing_m

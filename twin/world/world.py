@@ -108,10 +108,7 @@ class World(ABC):
         raise TwinError("imaging.fidelity", "the surrogate has no images", '"rendered"')
 
     def right_image(self) -> Image | None:
-        """Returns the right image (H, W, 3) of the last frame if it was captured without one; affects no other image.
-
-        None in a world without images.
-        """
+        """Returns the right image (H, W, 3) of the last frame captured without one, or None; affects no other image."""
         return None
 
     @abstractmethod

@@ -123,10 +123,8 @@ def _states_motion(message: Any) -> bool:
 
 
 def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str]:
-    """Returns those of the topics of type Imu that state an orientation, only those with a covariance if there are any.
-
-    If none does, it returns all of them or, if all messages mark their orientation as not measured, none, with a note.
-    """
+    """Returns the topics of type Imu that state an orientation, or those with a covariance if there are any."""
+    # If none does: all or, if all messages mark their orientation as not measured, none, with a note.
     first = {name: list(_first(bag, name)) for name in topics}
     stated = [name for name in topics if any(_states_orientation(message) for message in first[name])]
     known = [name for name in stated if any(np.any(message.orientation_covariance) for message in first[name])]
@@ -199,11 +197,8 @@ def _height(message: Any, _: str) -> tuple[Array, Array]:
 
 
 def _attitude(message: Any, place: str) -> tuple[Array, Array]:
-    """Returns roll, pitch, yaw (3,) [rad] and their variances (3,) [rad2] of a message Imu.
-
-    Both are zero if the orientation is marked as not measured or has no variance. The angles are NaN if it is not
-    finite; TwinError is raised if it is no rotation.
-    """
+    """Returns roll, pitch, yaw (3,) [rad], variances (3,) [rad2] of an Imu; 0: not measured, NaN: not finite."""
+    # TwinError if it is no rotation
     variances = np.array(message.orientation_covariance).reshape(3, 3).diagonal()
     if variances[0] < 0 or not variances.any():
         return np.zeros(3), np.zeros(3)

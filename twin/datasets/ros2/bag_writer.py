@@ -97,10 +97,8 @@ def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_
 
 
 def body_twists(times_s: Array, poses: Array) -> Array:
-    """Returns the twists (n, 6) [rotation, translation] (rad/s, m/s) in body axes of poses (n, 4, 4) world_from_body.
-
-    They follow from the motions to the next pose; the last pose has the twist of the one before, a single pose zero.
-    """
+    """Returns twists (n, 6) [rad/s, m/s] in body axes from the motions between poses (n, 4, 4) world_from_body."""
+    # the last pose has the twist of the one before, a single pose zero
     found = np.zeros((len(poses), 6))
     for k in range(len(poses) - 1):
         motion = geometry.inverse(np.ascontiguousarray(poses[k])) @ poses[k + 1]

@@ -31,11 +31,9 @@ class MessageFactory:
         return self.typestore.serialize_cdr(message, message.__msgtype__)
 
     def compressed_image(self, time_ns: int, frame: str, kind: str, data: bytes) -> Any:
-        """Returns sensor_msgs/CompressedImage with the bytes of an image file; `kind` is "png" or "jpeg".
-
-        As in compressed_image_transport, "rgb8; png compressed bgr8" is a file of bgr8 that becomes rgb8 for
-        subscribers.
-        """
+        """Returns sensor_msgs/CompressedImage with the bytes of an image file; `kind` is "png" or "jpeg"."""
+        # As in compressed_image_transport, "rgb8; png compressed bgr8" is a file of bgr8 that becomes rgb8 for
+        # subscribers.
         values = np.frombuffer(data, np.uint8)
         header = self._header(time_ns, frame)
         return self._make("sensor_msgs/CompressedImage", header, f"rgb8; {kind} compressed bgr8", values)
@@ -73,10 +71,7 @@ class MessageFactory:
         return self._imu(time_ns, (attitude, cov), (zero, _UNKNOWN), (zero, _UNKNOWN))
 
     def inertial(self, time_ns: int, rates_radps: Array, forces_mps2: Array, sigmas: tuple[float, float]) -> Any:
-        """Returns sensor_msgs/Imu with angular rates (3,) and specific forces (3,) in body axes, without orientation.
-
-        `sigmas` are the standard deviations of their white noise [rad/s, m/s2].
-        """
+        """Returns sensor_msgs/Imu: rates (3,), specific forces (3,) in body axes, their noise; no orientation."""
         rate_cov, force_cov = (np.diag([sigma**2] * 3).ravel() for sigma in sigmas)
         return self._imu(time_ns, (np.eye(3), _UNKNOWN), (rates_radps, rate_cov), (forces_mps2, force_cov))
 
@@ -91,19 +86,13 @@ class MessageFactory:
         return self._make("sensor_msgs/FluidPressure", self._header(time_ns, LEFT), pressure_pa, sigma_pa**2)
 
     def velocity(self, time_ns: int, velocity_mps: Array, sigma_mps: float) -> Any:
-        """Returns geometry_msgs/TwistWithCovarianceStamped with a velocity (3,) over ground in body axes.
-
-        The angular velocity is not measured; its variances are -1.
-        """
+        """Returns geometry_msgs/TwistWithCovarianceStamped with a velocity (3,) over ground in body axes, no rates."""
         covariance = np.diag([sigma_mps**2] * 3 + [_NOT_MEASURED] * 3).ravel()
         twist = self._twist(np.concatenate([np.zeros(3), velocity_mps]), covariance)
         return self._make("geometry_msgs/TwistWithCovarianceStamped", self._header(time_ns, BODY), twist)
 
     def fix(self, time_ns: int, position_m: Array, sigma_m: float) -> Any:
-        """Returns geometry_msgs/PoseWithCovarianceStamped with the position (3,) of the left camera in the world.
-
-        Its orientation is not measured; the variances are -1.
-        """
+        """Returns PoseWithCovarianceStamped with the position (3,) of the left camera in the world, no orientation."""
         covariance = np.diag([sigma_m**2] * 3 + [_NOT_MEASURED] * 3).ravel()
         pose = self._make(
             "geometry_msgs/Pose", *self._place(geometry.pose(np.eye(3), position_m), "geometry_msgs/Point")
@@ -128,9 +117,6 @@ class MessageFactory:
         return self._vector(pose[:3, 3], kind), self._quaternion(pose[:3, :3])
 
     def _twist(self, twist_body: Array, covariance: Array) -> Any:
-        """Returns geometry_msgs/TwistWithCovariance of a twist (6,) [rotation, translation].
-
-        `covariance` (36,) is the row-major 6 x 6 matrix in the order of ROS: linear before angular velocity.
-        """
+        """Returns geometry_msgs/TwistWithCovariance of [rotation, translation] (6,); covariance (36,) as in ROS."""
         twist = self._make("geometry_msgs/Twist", self._vector(twist_body[3:]), self._vector(twist_body[:3]))
         return self._make("geometry_msgs/TwistWithCovariance", twist, covariance)

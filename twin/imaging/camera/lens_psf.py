@@ -108,10 +108,8 @@ def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px:
 
 
 def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Returns the point spread functions as sums of products of a kernel along columns and one along rows.
-
-    The result is two arrays (3, terms, REACH_PX + 1) of symmetric kernels from the centre outwards; None: no blur.
-    """
+    """Returns the point spread functions as sums of products, two arrays (3, terms, REACH_PX + 1); None: no blur."""
+    # symmetric kernels from the centre outwards, along columns and along rows
     if not lens.diffraction and not any(lens.blur_px):
         return None
     bands = [_separable(_kernel(lens, sensor, band)) for band in range(3)]
@@ -146,11 +144,9 @@ def _separable(kernel: Array) -> list[tuple[float, Array]]:
 
 
 def _magnification(lens: LensConfig, rig: StereoRig) -> tuple[NDArray[Any], ...]:
-    """Returns the interpolation that magnifies the red and the blue band relative to the green one (lateral colour).
-
-    Runs of pixels whose first tap has the same offset, (k, 4) band, first column, end column, offset; weights (3, TAPS,
-    W) along the rows; the offset (3, H) of the first tap of each row; weights (3, H, TAPS).
-    """
+    """Returns the interpolation that magnifies red and blue relative to green (lateral colour)."""
+    # Runs of pixels whose first tap has the same offset, (k, 4) band, first column, end column, offset; weights (3,
+    # TAPS, W) along the rows; the offset (3, H) of the first tap of each row; weights (3, H, TAPS).
     red, blue = lens.lateral_colour
     scales = 1 + np.array([red, 0.0, blue])
     first, across = _taps_of(rig.width_px, rig.cx_px, scales)
@@ -299,10 +295,8 @@ def _defocus(light, near, scale, focus, out, first, end):
 
 @kernel
 def _defocus_row(above, here, below, diameter, out):
-    """Blurs a row (3 W,), except its ends, with the 3 x 3 kernel of the moments of a disc of `diameter` (3 W,) [px].
-
-    A disc of diameter c, here at most `SMALL_PX`, has the variance c^2 / 16 along each axis and <x^2 y^2> = c^4 / 384.
-    """
+    """Blurs a row (3 W,), not its ends, with 3 x 3 kernels of the moments of discs of `diameter` (3 W,) [px]."""
+    # A disc of diameter c <= `SMALL_PX` has the variance c^2 / 16 along each axis and <x^2 y^2> = c^4 / 384.
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]
     b0, b1, b2 = here[before], here[middle], here[after]

@@ -66,11 +66,9 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
 
 @kernel
 def _normal_to_poisson(expected, shot):
-    """Replaces normal numbers z in `shot` (n,) by approximately Poisson-distributed counts of mean `expected`.
-
-    The counts are round(m + s z + (z^2 - 1) / 6), the first terms of the Cornish-Fisher expansion (1938); s^2 = m -
-    1/18 - 1/12 compensates for the variance of the quadratic term and of the rounding.
-    """
+    """Replaces normal numbers z in `shot` (n,) by about Poisson-distributed counts of mean m, `expected`."""
+    # round(m + s z + (z^2 - 1) / 6), the first terms of the Cornish-Fisher expansion (1938); s^2 = m - 1/18 - 1/12
+    # compensates for the variance of the quadratic term and of the rounding
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(shot.size):
         z, m = shot[k], expected[k]

@@ -73,10 +73,8 @@ def air_coordinates(port: PortConfig, points_m: Array) -> Array:
 
 
 def refract(ray: Array, normal: Array, ratio: float) -> Array:
-    """Returns the refracted unit vectors (..., 3) by Snell's law; NaN where light is totally reflected.
-
-    `ray` and `normal` (..., 3) are unit vectors in the direction of propagation, `ratio` is the index before / behind.
-    """
+    """Returns unit vectors (..., 3) by Snell's law; NaN at total reflection; `ratio`: index before / behind."""
+    # `ray` and `normal` (..., 3) are unit vectors in the direction of propagation
     cosine = _dot(ray, normal)[..., None]
     with np.errstate(invalid="ignore"):
         behind = np.sqrt(1 - ratio**2 * (1 - cosine**2))

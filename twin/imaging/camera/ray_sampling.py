@@ -63,10 +63,8 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
 
 @kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
-    """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
-
-    Rows 2 and 3 get the vanishing points, 4 and 5 the parallax, 6 the inverse depth, where the next row starts.
-    """
+    """Fills rows 0, 1 of `rays` (8, w) with columns and rows where the rays of row v meet the floor."""
+    # rows 2 and 3: vanishing points, 4 and 5: parallax, 6: inverse depth, where the next row starts
     rows, cols = near.shape
     x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]
     inverse, part_x, part_y = rays[6], rays[0], rays[1]

@@ -85,11 +85,8 @@ def _blur_by_motion(light, depth, focal, twist, exposure_s, out, first, end):
 
 @kernel(error_model="numpy")
 def _blur_weights(depth, x, y, scale, twist, weights):
-    """Computes the weights (4, W) of `_blur_row`; returns whether all paths of the row are short (`SHORT_PX`).
-
-    The 3 x 3 kernel has the moments of a uniform path (a, b) [px]: a^2 / 12, b^2 / 12, a b / 12, a^2 b^2 / 80. The
-    weights are for the neighbours in the row, in the column, on the falling and on the rising diagonal.
-    """
+    """Computes weights (4, W) of `_blur_row`: row, column, falling, rising diagonal; returns if all are `SHORT_PX`."""
+    # The 3 x 3 kernel has the moments of a uniform path (a, b) [px]: a^2 / 12, b^2 / 12, a b / 12, a^2 b^2 / 80.
     half, quarter, one, n_long = np.float32(0.5), np.float32(0.25), np.float32(1.0), 0
     across, down, falling, rising = weights[0], weights[1], weights[2], weights[3]
     for u in range(x.size):
@@ -127,11 +124,9 @@ def _blur_row(above, here, below, weights, out):
 
 @kernel(inline="always")
 def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
-    """Writes to `out` the mean radiance over a straight path centred on pixel (a, b), from an odd number of samples.
-
-    The path extends by `length` along the first axis and by `aside`, not longer, along the second [px]; samples are a
-    pixel apart along the first. The weight of the two ends gives the variance length^2 / 12.
-    """
+    """Writes to `out` the mean radiance over a straight path centred on pixel (a, b), from an odd number of samples."""
+    # The path extends by `length` along the first axis, a sample per pixel, and `aside`, not longer, along the second
+    # [px]. The weight of the two ends gives the variance length^2 / 12.
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]
     red, green, blue = here[0], here[1], here[2]

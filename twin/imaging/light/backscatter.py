@@ -23,10 +23,7 @@ MARGIN = 6  # rows and columns of the grid outside each side of the image, whose
 
 
 def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Array) -> Array:
-    """Returns the backscatter (..., n, 3) per metre along rays (..., 3), without its blur on the way [cd/m3].
-
-    With multiple scattering it is that of the lamps alone.
-    """
+    """Returns the backscatter (..., n, 3) per metre along rays (..., 3) [cd/m3], unblurred; multiple: lamps alone."""
     points = ray[..., None, :] * range_m[..., None]
     total = np.zeros(points.shape)
     for lamp in range(len(lamps.sources.intensity_cd)):

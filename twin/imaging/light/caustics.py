@@ -1,11 +1,13 @@
 """Caustics: bright moving lines on the floor where waves on the water surface focus the sunlight.
 
-The surface is a sum of waves with the spectrum of `waves`, periodic in a square tile. A ray of the sun that meets the
-surface at a small slope s is displaced at the depth D by q D (s + h (h . s) / w^2), where (h, -w) is its unit direction
-under the level surface and q = 1 - c / (n w), with c the cosine of its zenith angle in air and n the refractive index
-(derivative of Snell's law). For a sun in the zenith it is (1 - 1/n) s D. The pattern is blurred by waves that the cells
-do not resolve (normally distributed deflections), by the disc of the sun, and by scattering (Wells 1973). Waves longer
-than the tile focus far below the floor and are left out.
+The surface is a sum of waves with the spectrum of a fully developed sea from gravity to capillary waves (Elfouhaily et
+al. 1997, J. Geophys. Res. 102, 15781), periodic in a square tile: the elevation has the spectrum S(k) = B(k) / k^3, the
+slopes the variance int B / k dk, spread over directions phi from the wind with (1 + Delta(k) cos(2 phi)) / (2 pi). A
+ray of the sun that meets the surface at a small slope s is displaced at the depth D by q D (s + h (h . s) / w^2), where
+(h, -w) is its unit direction under the level surface and q = 1 - c / (n w), with c the cosine of its zenith angle in
+air and n the refractive index (derivative of Snell's law). For a sun in the zenith it is (1 - 1/n) s D. The pattern is
+blurred by waves that the cells do not resolve (normally distributed deflections), by the disc of the sun, and by
+scattering (Wells 1973). Waves longer than the tile focus far below the floor and are left out.
 """
 
 import threading
@@ -19,7 +21,6 @@ from twin.core.geometry import Array
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.phase_function import BandWater, table_of
 from twin.imaging.light.water import Medium
-from twin.imaging.light.waves import angular_frequency, slope_density, slope_variance
 from twin.kernels import kernel
 from twin.scenario.model import SEA_WATER_INDEX
 
@@ -31,6 +32,12 @@ LEAST_CELLS = 0.9  # least standard deviation of the blur in cells, so that ligh
 SUN_RAD = 0.00465 / 2 / SEA_WATER_INDEX
 STREAM = 1 << 16  # key of the random stream for the waves
 _HEIGHTS, _ANGLES, _WAVE_NUMBERS = 24, 512, 80  # numbers of nodes of `scattering_blur`
+GRAVITY_MPS2 = 9.81
+#: Wave number [rad/m] and phase speed [m/s] of the slowest waves; shorter waves are capillary waves.
+SLOWEST_RAD_PER_M, SLOWEST_MPS = 370.0, 0.23
+INVERSE_WAVE_AGE = 0.84  # of a fully developed sea
+_PEAK_ENHANCEMENT, _PEAK_WIDTH = 1.7, 0.08 * (1 + 4 / INVERSE_WAVE_AGE**3)  # JONSWAP
+_SHORTEST_RAD_PER_M = 2e4  # the spectrum of shorter waves is negligible
 
 
 class Caustics:
@@ -150,10 +157,8 @@ def _wave_numbers(tile_m: float) -> tuple[Array, Array]:
 
 
 def _packed(transfer: Array) -> Array:
-    """Returns the factors (CELLS, CELLS) of the numbers in a spectrum of `cv2.dft` of a real image.
-
-    OpenCV stores both parts of a coefficient in columns 2 k - 1 and 2 k or, in the first and last column, in such rows.
-    """
+    """Returns the factors (CELLS, CELLS) of the numbers in a spectrum of `cv2.dft` of a real image."""
+    # It stores the parts of a coefficient in columns 2 k - 1 and 2 k or, in the first and last, in such rows.
     index = np.arange(CELLS)
     half = (index + 1) // 2
     rows = np.where((half == 0) | (half == CELLS // 2), half[:, None], index[:, None])
@@ -162,10 +167,7 @@ def _packed(transfer: Array) -> Array:
 
 @kernel(error_model="numpy")
 def _add_waves(east, north, cosine, sine, spectrum):
-    """Adds waves to the spectrum of a complex image: slope towards east + i slope towards north.
-
-    Both are real: the coefficient of a wave number determines that of the opposite wave number.
-    """
+    """Adds waves to the spectrum of the slope to the east + i the slope to the north, both real: -k mirrors k."""
     n, half = spectrum.shape[0], spectrum.shape[1] // 2
     for i in range(n):
         opposite = spectrum[(n - i) % n]
@@ -198,3 +200,50 @@ def _trace_rays(east, north, cells_per_slope, light):
             light[m, k1] += w * (one - h)
             light[m1, k] += (one - w) * h
             light[m1, k1] += w * h
+
+
+def angular_frequency(k: Array) -> Array:
+    """Returns the angular frequency of waves in deep water [rad/s]: omega^2 = g k (1 + (k / 370)^2)."""
+    return np.sqrt(GRAVITY_MPS2 * k * (1 + (k / SLOWEST_RAD_PER_M) ** 2))
+
+
+def curvature_spectrum(k: Array, wind_mps: float) -> Array:
+    """Returns the omnidirectional curvature spectrum B(k) at wave numbers above 0 (Elfouhaily, eq. 30 to 41)."""
+    peak = GRAVITY_MPS2 * (INVERSE_WAVE_AGE / wind_mps) ** 2
+    speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
+    ratio = np.sqrt(k / peak)
+    around_peak = np.exp(-1.25 / ratio**4) * _PEAK_ENHANCEMENT ** np.exp(-((ratio - 1) ** 2) / (2 * _PEAK_WIDTH**2))
+    long = 0.006 * np.sqrt(INVERSE_WAVE_AGE) * peak_mps / speed
+    long *= np.exp(-INVERSE_WAVE_AGE / np.sqrt(10) * (ratio - 1))
+    friction = np.log(_friction_mps(wind_mps) / SLOWEST_MPS)
+    short = max(0.01 * (1 + (friction if friction <= 0 else 3 * friction)), 0.0) * SLOWEST_MPS / speed
+    short *= np.exp(-0.25 * (k / SLOWEST_RAD_PER_M - 1) ** 2)
+    return 0.5 * around_peak * (long + short)
+
+
+def directionality(k: Array, wind_mps: float) -> Array:
+    """Returns Delta(k), the relative difference of the spectrum along and across the wind (Elfouhaily, eq. 57)."""
+    speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
+    short = 0.13 * _friction_mps(wind_mps) / SLOWEST_MPS
+    return np.tanh(np.log(2) / 4 + 4 * (speed / peak_mps) ** 2.5 + short * (SLOWEST_MPS / speed) ** 2.5)
+
+
+def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
+    """Returns the slope variance per area of wave numbers along and across the wind [m^2/rad^2]; 0 at k = 0."""
+    k = np.hypot(kx, ky)
+    k_or_1 = np.where(k > 0, k, 1.0)
+    spread = 1 + directionality(k_or_1, wind_mps) * (kx**2 - ky**2) / k_or_1**2
+    return np.where(k > 0, curvature_spectrum(k_or_1, wind_mps) * spread / (2 * np.pi * k_or_1**2), 0.0)
+
+
+def slope_variance(wind_mps: float, above_rad_per_m: float = 1e-3) -> tuple[float, float]:
+    """Returns the variances of the slope along and across the wind, due to waves above a given wave number."""
+    k = np.geomspace(above_rad_per_m, max(_SHORTEST_RAD_PER_M, 2 * above_rad_per_m), 4000)
+    per_k, quarter = curvature_spectrum(k, wind_mps) / k, directionality(k, wind_mps) / 4
+    along, across = (float(np.trapezoid(per_k * share, k)) for share in (0.5 + quarter, 0.5 - quarter))
+    return along, across
+
+
+def _friction_mps(wind_mps: float) -> float:
+    """Returns the friction velocity of the wind [m/s], with the drag coefficient (0.8 + 0.065 U) 1e-3 (Wu 1982)."""
+    return wind_mps * np.sqrt(1e-3 * (0.8 + 0.065 * wind_mps))

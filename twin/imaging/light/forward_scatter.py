@@ -183,10 +183,8 @@ def _plane_terms(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
 
 
 def _tables(weights: Array, focal_px: float) -> NDArray[np.float32]:
-    """Returns the tables (levels, n, 8) of `_weigh`: the weights (levels, n, 3) and a zero, their changes and a zero.
-
-    Changes are those if all light of narrow levels (up to `WIDENED_TAN` focal lengths, not the last) moves to the next.
-    """
+    """Returns the tables (levels, n, 8) of `_weigh`: weights (levels, n, 3) and 0, their changes and 0."""
+    # changes if all light of levels up to `WIDENED_TAN` focal lengths, not the last, moves to the next
     leaves = np.array([level_sigma_px(k + 1) <= WIDENED_TAN * focal_px for k in range(len(weights))])
     leaves[-1] = False
     leaving = weights * leaves[:, None, None]
@@ -260,10 +258,8 @@ def _weigh(image, place, table, widening, wider):
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _add_upsampled(small, light, first, end):
-    """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows of `light` (H, 3 W).
-
-    The filters are (1, 6, 1) / 8 and (1, 1) / 2; rows and columns before the first are mirrored, the last is repeated.
-    """
+    """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows of `light` (H, 3 W)."""
+    # filters (1, 6, 1) / 8 and (1, 1) / 2; rows and columns before the first are mirrored, the last is repeated
     last, width = small.shape[0] - 1, light.shape[1] // 3
     cols = small.shape[1] // 3
     wide = np.empty(3 * (cols + 2), np.float32)

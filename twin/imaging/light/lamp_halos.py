@@ -74,12 +74,10 @@ class LampHalos:
 
 @lru_cache(maxsize=64)
 def _halo_of(water: BandWater) -> tuple[Array, Array, Array]:
-    """Returns the halo of a lamp at distances `NODES_M`, three arrays.
-
-    They are the share (nodes,) of the scattered light that is turned by less than CORE_RAD, the factor (nodes,) by
-    which less light is missing than hidden (REFLECTED), and paths (nodes, PATHS, 4): direction of the scattering from
-    the floor, its component towards the lamp first, and its distance divided by that of the lamp.
-    """
+    """Returns the halo of a lamp at distances `NODES_M`: shares of CORE_RAD, factors REFLECTED, and paths."""
+    # The share (nodes,) of the scattered light turned by less than CORE_RAD, the factor (nodes,) by which less light is
+    # missing than hidden; paths (nodes, PATHS, 4): direction of the scattering from the floor, its component towards
+    # the lamp first, and its distance / that of the lamp.
     weights, turn = lamp_mixture(water, NODES_M, "particle"), np.linspace(CORE_RAD, MOST_TURNED, TURN_STEPS)
     square = (turn / LAMP_SIGMA_RAD[:, None]) ** 2
     beyond = weights @ ((1 + square) * np.exp(-square / 2)) / weights.sum(1, keepdims=True)
@@ -137,11 +135,9 @@ def _around_shadows(lit, stride, rows, cols, stack):
 
 @kernel(error_model="numpy")
 def hidden_share(solid, point, lamp, halo, dark):
-    """Returns the share of the scattered light of a lamp that a point of the floor lacks, 0 to 1.
-
-    `solid`: grid (see `Shadows`), its highest node and the horizontal distance of blockers from the point [m]; `lamp`:
-    position [m], axis and beam; `dark`: whether the point is in the shadow of the lamp.
-    """
+    """Returns the share (0 to 1) of the scattered light of a lamp that a point of the floor lacks."""
+    # `solid`: grid (`Shadows`), highest node, distance of blockers [m]; `lamp`: position [m], axis, beam; `dark`: in
+    # shadow
     (position, axis, beam), (core, dark_part, paths) = lamp, halo
     ax, ay, az = position[0] - point[0], position[1] - point[1], position[2] - point[2]
     d = np.sqrt(ax * ax + ay * ay + az * az)
@@ -218,10 +214,8 @@ def _blocks(solid, start, to, from_floor):
 
 @kernel(error_model="numpy")
 def _interpolate(hidden, stride, depth, lit):
-    """Adds the hidden share of tested pixels to all pixels, as weighted means of the four around each.
-
-    Weights are those of bilinear interpolation, times nearness in depth; those in the same light or shadow count most.
-    """
+    """Adds the hidden share of tested pixels to all: weighted means of the four around each."""
+    # bilinear weights times nearness in depth; those in the same light or shadow count most
     rows, cols = hidden.shape
     height, width = depth.shape
     for r in range(rows - 1):

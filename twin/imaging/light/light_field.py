@@ -46,11 +46,8 @@ class _Mode(NamedTuple):
 
 
 def legendre_moments(phase: PhaseTable, orders: int) -> Array:
-    """Returns the moments chi_l = 2 pi integral p P_l dmu of a phase function p for l = 0 to `orders`.
-
-    P_l is the Legendre polynomial of degree l, and mu the cosine of the scattering angle. The integral is computed by
-    the midpoint rule over the cells of the table.
-    """
+    """Returns the moments 2 pi integral p P_l dmu of a phase function p for l = 0 to `orders`, mu = cosine."""
+    # by the midpoint rule over the cells of the table
     share = np.diff(phase.cumulative)
     return np.array([share @ values for values in _polynomials(len(share), orders)])
 
@@ -194,11 +191,9 @@ class LightField:
 
 
 def _without_peak(water: BandWater) -> tuple[float, float, Array]:
-    """Returns attenuation, scattering and moments (ORDERS,) without the forward peak, a narrow Gaussian (delta-M+).
-
-    The peak has the moments f exp(-l^2 / (2 s^2)), with f and s such that the remaining moments reach 0 with slope 0 at
-    l = `ORDERS`; another slope (delta-M) makes the radiance oscillate by up to 6 %.
-    """
+    """Returns attenuation, scattering and moments (ORDERS,) without the forward peak, a narrow Gaussian (delta-M+)."""
+    # It has the moments f exp(-l^2 / (2 s^2)), with f and s such that the rest reaches 0 with slope 0 at l = `ORDERS`;
+    # another slope (delta-M) makes the radiance oscillate by up to 6 %.
     chi, b = legendre_moments(table_of(water.scatterer), ORDERS + 1), water.scattering_per_m
     peak = np.zeros(ORDERS)
     if chi[ORDERS] > LEAST_PEAK and chi[ORDERS + 1] > 0:

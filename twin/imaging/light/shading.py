@@ -113,11 +113,9 @@ def shade(
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, range_m, normal):
-    """Computes range (W,) and normals (3, W) of the facets in a row of pixels, in the axes of the camera, upwards.
-
-    A pixel that shows several facets gets the mean of their normals at `SAMPLES`, on the plane of the central facet:
-    the light of a matt facet is proportional to a component of its normal.
-    """
+    """Computes range (W,) and upward normals (3, W) in camera axes, in a row of pixels; of several facets, the mean."""
+    # at `SAMPLES`, on the plane of the central facet: the light of a matt facet is proportional to a component of its
+    # normal
     normals, origin, grid, turn = facets
     zero, one, half, far = np.float32(0), np.float32(1), np.float32(0.5), np.float32(FAR_M)
     centre, flat, n_samples = half * np.float32(here.size - 1), normals.reshape(-1), SAMPLES.shape[0]
@@ -236,11 +234,8 @@ def _range_and_normal(depth, v, y, focal, range_m, normal):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _illuminate(lamp, here, y, focal, normal, out):
-    """Fills `out` (3, W) for a lamp without beam pattern and attenuation.
-
-    Rows: illuminance by an isotropic lamp in clear water; sqrt(1 - cos(angle from the beam axis)); distance. The first
-    two are 0 and 1 without floor, where it faces away, and more than 90 deg from the beam axis.
-    """
+    """Fills `out` (3, W): illuminance by a lamp in clear water, sqrt(1 - cos(angle from its axis)), distance."""
+    # 0 and 1 without floor, where it faces away, and more than 90 deg from the beam axis
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     x0, y0, z0, ax, ay, az, intensity = lamp[0], lamp[1], lamp[2], lamp[3], lamp[4], lamp[5], lamp[6]
     width = here.size
@@ -366,10 +361,8 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
-    """Fills row 1 of `daylight` (3, W) with row 0 times the cosine (at least 0) to the sun, row 2 with the depth [m].
-
-    Row 0 is the daylight relative to its mean (`_sample_caustics`). The normals of pixels without floor become 0.
-    """
+    """Fills row 1 of `daylight` (3, W) with row 0 times the cosine to the sun (least 0), row 2 with the depth [m]."""
+    # Row 0 is relative to the mean (`_sample_caustics`); the normals of pixels without floor become 0.
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for u in range(here.size):
         there = here[u] < far
@@ -454,10 +447,8 @@ def _reflect(albedo, light, backscatter, out):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
-    """Fills `out` (W, 3), row v of an image, with the backscatter plus the share `kept`, if any, of the floor's light.
-
-    If v is even, it also fills row v / 2 of `place` with the fractional row of `kept` for every second pixel.
-    """
+    """Fills `out` (W, 3), row v of an image: backscatter, plus the share `kept`, if any, of the light of the floor."""
+    # an even v also fills row v / 2 of `place`: the fractional row of `kept` for every second pixel
     of_row, shown = out.reshape(-1), floor.reshape(-1)
     if kept.shape[0] == 0:
         for u in range(range_m.size):

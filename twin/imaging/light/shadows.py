@@ -253,11 +253,8 @@ def _occluded_in_block(height, cell_tops, block_top, x, y, z, dx, dy, dz, t, end
 
 @kernel(error_model="numpy")
 def _above_in_cell(height, r, c, x, y, z, dx, dy, dz, t, leave):
-    """Returns whether the floor of a cell is above the ray between t and `leave`.
-
-    (x, y) is the start of the ray relative to the cell's south-west node, in cells. Over a triangle, the height of the
-    ray above the floor is linear in t, so it is tested where the ray leaves the triangle.
-    """
+    """Returns whether the floor of a cell is above the ray, from (x, y) in it [cells], between t and `leave`."""
+    # Over a triangle, the height of the ray above the floor is linear in t, so it is tested where the ray leaves it.
     south_west, south_east = height[r, c], height[r, c + 1]
     north_west, north_east = height[r + 1, c], height[r + 1, c + 1]
     across = dx - dy

@@ -62,10 +62,7 @@ def ring_shares(edges: Array, sigmas: Array) -> Array:
 
 
 def over_path(share: Array, scattering_per_m: float, path_m: Array) -> Array:
-    """Returns values (..., m) at path lengths (m,) [m], interpolated from `share` (..., nodes) at `NODES_M`.
-
-    What is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d).
-    """
+    """Returns values (..., m) at path lengths (m,) [m], from `share` (..., nodes) of 1 - exp(-b d) at `NODES_M`."""
     of_scattered = share / -np.expm1(-scattering_per_m * np.array(NODES_M))
     at = np.interp(np.log(np.maximum(path_m, 1e-9)), np.log(NODES_M), np.arange(len(NODES_M)))
     low = np.minimum(at.astype(int), len(NODES_M) - 2)
@@ -93,11 +90,8 @@ def _phase_on_rings(scatterer: Scatterer, most: float) -> Array:
 
 @cache
 def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
-    """Returns two tables (ANGLES, ANGLES) over the scattering angle t and the angle beta at the lamp.
-
-    The first is the response of the receiver times the width of the part of the cell of beta that is below t, the
-    second the excess length of the scattered path relative to the straight one, path / d - 1.
-    """
+    """Returns two tables (ANGLES, ANGLES) over the scattering angle t and the angle beta at the lamp."""
+    # response of the receiver times the part of the cell of beta below t, and path / d - 1
     edges = _rings(np.pi)
     t = _middle(edges)[:, None]
     inside = np.clip(t - edges[:-1], 0.0, np.diff(edges))  # the part of each cell of beta that is below t

@@ -67,11 +67,8 @@ def turn_by_cosine(x, y, z, cosine, rng):
 
 @kernel
 def sample_guide(cumulative_angle, rng):
-    """Returns the cosine of a random angle from the direction to a lamp or the sun, for directions sampled around it.
-
-    Half of them are for light scattered once (uniform between 0 and a `sample_angle`), half are wider
-    (Henyey-Greenstein with the mean cosine `GUIDE_G`, by inversion).
-    """
+    """Returns the cosine of a random angle from the direction to a light: half by `sample_angle`, half wider."""
+    # uniform between 0 and a `sample_angle`, for light scattered once; Henyey-Greenstein of mean cosine `GUIDE_G`
     if rng.random() < 0.5:
         return np.cos(sample_angle(cumulative_angle, rng) * rng.random())
     g = GUIDE_G

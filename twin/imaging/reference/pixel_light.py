@@ -129,11 +129,7 @@ class PlaneLight:
 
 
 class KernelScene(NamedTuple):
-    """A `ReferenceScene` and `Effort.plain` in the form of the compiled kernels, without lamps of zero intensity.
-
-    `beams` (n, BEAM_STEPS + 1) are the relative intensities of the lamps from 0 to 90 deg, and `sun_cosine` is the
-    cosine of the angular radius of the sun's disc.
-    """
+    """A `ReferenceScene` and `Effort.plain` for the kernels, without lamps of zero intensity."""
 
     absorption: float
     scattering: float

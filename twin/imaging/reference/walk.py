@@ -70,10 +70,8 @@ def towards(lamp, point):
 
 @kernel
 def straight(scene, kind, point, axis, before, density, step_m):
-    """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
-
-    If the direction from `before` was sampled with a `density` [1/sr] above 0, it is weighted by `share_of_walk`.
-    """
+    """Returns the unscattered light of all lamps at a vertex, times its `response` [cd/m2]."""
+    # weighted by `share_of_walk` if the direction from `before` was sampled with a `density` [1/sr] above 0
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
         lamp = scene.lamps[k]
@@ -130,11 +128,9 @@ def by_one_scattering(scene, kind, point, axis, guided, rng):
 
 @kernel
 def sunlight(scene, kind, point, axis, guided, rng):
-    """Returns the unscattered sunlight at a vertex, times the `response` of the vertex [cd/m2].
-
-    For a vertex in water, a sun with a disc is sampled at a random point of the disc, and its light is weighted by
-    1 - `share_of_escape`. At the floor, all light comes from the centre of the disc.
-    """
+    """Returns the unscattered sunlight at a vertex, times its `response` [cd/m2]."""
+    # In water, a random point of the disc is weighted by 1 - `share_of_escape`; at the floor, all comes from its
+    # centre.
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     if scene.sun_lx <= 0 or point[2] >= scene.surface_m:
         return 0.0
@@ -212,10 +208,8 @@ def next_direction(scene, kind, point, axis, guided, rng):
 
 @kernel
 def direction_density(scene, kind, point, axis, guided, own, x, y, z):
-    """Returns the density [1/sr] of `next_direction` at the direction (x, y, z), whose response at the vertex is `own`.
-
-    `own` is the density of the phase function; divided by the albedo, that of Lambert's cosine.
-    """
+    """Returns the density [1/sr] of `next_direction` at (x, y, z), whose response at the vertex is `own`."""
+    # `own`: density of the phase function or, divided by the albedo, of Lambert's cosine
     own = own / scene.albedo if kind == ON_FLOOR else own
     upwards = upward_share(scene, kind, axis, guided)
     if upwards > 0:
@@ -245,11 +239,8 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
 
 @kernel
 def bin_of(view, bin_edges_px, x, y, z):
-    """Returns the bin of the distance in the image between a pixel and the projection of a point; the last one is open.
-
-    `view` (5, 3) has the axes of the camera in the world, its position [m], and column and row of the pixel from the
-    principal point and the focal length [px]. Points behind the camera are in the last bin.
-    """
+    """Returns the bin of the distance in the image from a pixel to a point; the last one is open, and behind."""
+    # `view` (5, 3): camera axes in the world, position [m], pixel from the principal point and focal length [px]
     a, b, c = x - view[3, 0], y - view[3, 1], z - view[3, 2]
     depth = a * view[2, 0] + b * view[2, 1] + c * view[2, 2]
     last = bin_edges_px.shape[0] - 1
@@ -349,10 +340,8 @@ def walk(scene, view, bin_edges_px, kind, point, axis, weight, rng, sums):
 
 @kernel
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
-    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2], ordered as `sums` of `walk`: the mean of pairs of walks.
-
-    One walk of a pair starts at the floor, one in the water; unscattered light on the floor point takes none.
-    """
+    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2], as `sums` of `walk`: the mean of pairs of walks."""
+    # One of a pair starts at the floor, one in the water; unscattered light on the floor point takes none.
     sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
     centre = (view[3, 0], view[3, 1], view[3, 2])
     a, b, f = view[4, 0], view[4, 1], view[4, 2]
