@@ -168,7 +168,7 @@ def test_the_table_distinguishes_rendered_from_surrogate_surveys(searched):
 def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(searched):
     _, result, folder = searched
     headline = tuning_report.headline(result)
-    assert "6 of 6 rendered surveys passed: with 95 % confidence at least 54.1 % pass, 50 % required" in headline
+    assert "6 of 6 rendered surveys passed; with 95 % confidence at least 54.1 % pass, 50 % required" in headline
     median = result.verification(result.recommended).medians["map.le90_m"]
     assert f"{1e3 * median[1]:.1f} mm ({1e3 * median[0]:.1f} mm)" in headline.replace("1.0 cm", "10.0 mm")
     tuning_report.write_tuning_report(result, folder)
