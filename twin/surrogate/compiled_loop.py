@@ -56,11 +56,9 @@ def compiled_loop(
 
 @kernel
 def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, reference, normals, n_steps, interval_s):
-    """Runs the closed loop over at most n frames, until `has_ended`.
-
-    Returns the number of simulated frames, the dead-reckoning state after the last one, the poses (n, 4, 4), true, by
-    F2F alone and online, and `PoseLog.steps` with their variances (n, 6); only the simulated frames are set.
-    """
+    """Runs the closed loop over at most n frames, until `has_ended`."""
+    # returns the number of simulated frames, the dead-reckoning state after the last one, the poses (n, 4, 4), true, by
+    # F2F alone and online, and `PoseLog.steps` with variances (n, 6); only simulated frames are set
     positions, velocities, yaws, accelerations = reference
     vision_normals, sensor_normals, dvl_normals = normals
     n = len(positions)

@@ -27,10 +27,8 @@ class FloorRelief(NamedTuple):
 
 
 def floor_relief(height_m: Map, cell_m: float, rig: StereoRig, depth_m: float) -> FloorRelief:
-    """Returns the relief of a floor of heights (rows, cols); in images, NaN is as low as the lowest height.
-
-    `rig` is the calibration of the images that are matched, `depth_m` a typical depth along the optical axis.
-    """
+    """Returns the relief of a floor of heights (rows, cols); in images, NaN is as low as the lowest height."""
+    # `rig`: calibration of the images that are matched; `depth_m`: a typical depth along the optical axis
     slope = np.stack(map_slopes(np.asarray(height_m, np.float64), cell_m), axis=-1).astype(np.float32)
     filled = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
     window_cells = WINDOW_PX * depth_m / rig.focal_px / cell_m

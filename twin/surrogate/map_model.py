@@ -122,10 +122,8 @@ class MapModel:
         cell_view.mark_visible(self._cells, self._cameras, window, world_from_camera, self.seen.reshape(-1))
 
     def observe(self, true: Array, estimated: Array) -> ObservedCells:
-        """Returns the cells that a keyframe with a true and an estimated pose (4, 4) observes.
-
-        With calibration errors or an approximated port, the estimated pose determines which point is mapped to a cell.
-        """
+        """Returns the cells that a keyframe with a true and an estimated pose (4, 4) observes."""
+        # with calibration errors or an approximated port, the estimated pose determines which point is mapped to a cell
         window = cell_view.window_in_reach(self._cells, self._cameras, self._lowest_m, true)
         found = cell_view.visible_cells(self._cells, self._cameras, window, true, estimated)
         return ObservedCells(*found, true, estimated)
@@ -199,10 +197,8 @@ class MapModel:
 
 
 def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
-    """Returns standard normal numbers (rows, cols) that are correlated over a square window, as matching errors are.
-
-    Their standard deviation exceeds 1 if the array has fewer rows or columns than the window.
-    """
+    """Returns standard normal numbers (rows, cols) that are correlated over a square window, as matching errors are."""
+    # their standard deviation exceeds 1 if the array has fewer rows or columns than the window
     noise = rng.standard_normal(shape, np.float32)
     return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
 

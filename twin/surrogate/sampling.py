@@ -130,10 +130,8 @@ def sample_link(
 
 @kernel
 def _yaw(observations, weight, inverse, right, change_a, change_b):
-    """Returns the yaw of the right camera, its standard deviation and its effect (6,) on the motion, as one (8,).
-
-    See `two_view_motion.YawEffect`; the standard deviation is infinite if the yaw is not observable.
-    """
+    """Returns yaw of the right camera, standard deviation (inf: not observable) and effect (6,) on the motion, (8,)."""
+    # see `two_view_motion.YawEffect`
     coupling, information, score = np.zeros(6), 0.0, 0.0
     for k in range(len(weight)):
         derivative = change_a[k] - observations.jacobian_point[k] @ change_b[k]
@@ -168,11 +166,9 @@ def _floor_cell(pose, point, baseline, cell_m, n):
 
 @kernel
 def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> Array:
-    """Returns the covariance (6, 6) of a motion estimated from flow and known depth.
-
-    The motion is estimated by least squares, Negahdaripour & Madjidi (2003), eq. (2), from `n_effective` flow vectors
-    of unit standard deviation, distributed over image and depth as `points` (n, 3), normalised (x, y, disparity).
-    """
+    """Returns the covariance (6, 6) of a motion estimated from flow and known depth."""
+    # least squares, Negahdaripour & Madjidi (2003), eq. (2), from `n_effective` flow vectors of unit standard
+    # deviation, distributed over image and depth as `points` (n, 3), normalised (x, y, disparity)
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])
     normal, _ = observation_equations.normal_equations(jacobian, np.full(n, n_effective / n), np.zeros((n, 2)))
@@ -181,10 +177,8 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> Array
 
 @kernel
 def measured_motion(points, earlier_pose, later_pose, camera, cov):
-    """Returns the motion earlier_from_later (4, 4) that is estimated from points without noise; see `sample_link`.
-
-    It is the true motion if all points are measured at their true positions, or if too few of them are in both views.
-    """
+    """Returns the motion earlier_from_later (4, 4) that is estimated from points without noise; see `sample_link`."""
+    # the true one if all points are measured at their true positions, or if too few of them are in both views
     if not camera[-1].values.size and camera[-1].yaw_rad == 0:
         return geometry.inverse(earlier_pose) @ later_pose
     noise, cells, normals = np.zeros(points.shape), np.zeros((1, 1, 3)), np.zeros((len(points) + 1, 3))
@@ -196,12 +190,9 @@ def measured_motion(points, earlier_pose, later_pose, camera, cov):
 
 @kernel
 def mosaic_correction(estimated, measured_motions, fractions, predicted_pose):
-    """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors.
-
-    Each keyframe in the mosaic is displaced by the error of the pose at which it was added. The correction is the mean
-    over the keyframes in view, weighted by `MosaicView.fractions`, given the pose (n, 4, 4) of the frame relative to
-    each of them without matching errors.
-    """
+    """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors."""
+    # each keyframe is displaced by the error of the pose at which it was added: their mean over those in view by
+    # `MosaicView.fractions`, given poses (n, 4, 4) of the frame relative to each, without matching errors
     predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)
     for k in range(len(fractions)):
         in_mosaic = estimated[k] @ measured_motions[k]

@@ -411,11 +411,9 @@ def corner_count(rig: StereoRig, settings: EstimatorSettings) -> float:
 
 
 def overlap_inflation(n_points: float, rig: StereoRig, patch_px: int) -> float:
-    """Returns the variance of a mean over n patches, relative to that of patches without common pixels.
-
-    It is the expected value of `matching.variance_inflation` for patches spread over the image at random, which share a
-    fraction patch_px^2 / (width height) of their pixels on average.
-    """
+    """Returns the variance of a mean over n patches, relative to that of patches without common pixels."""
+    # the expected value of `matching.variance_inflation` for patches spread at random, which share a fraction
+    # patch_px^2 / (width height) of their pixels on average
     return 1 + n_points * patch_px**2 / (rig.width_px * rig.height_px)
 
 

@@ -56,11 +56,9 @@ class ElevationMapper:
         self._lateral_m: list[float] = [0.0, 0.0]  # sum and number of the lateral errors of the patches
 
     def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
-        """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
-
-        A cell was propagated if the successor, the patch of the next keyframe, has a height for it, at a pixel whose
-        depth contains information from this keyframe (mask `inherited` (H, W)), and the two heights agree.
-        """
+        """Fuses those cells of a patch into the map that were not propagated to the next keyframe."""
+        # propagated: the successor (patch of the next keyframe) has an agreeing height at a pixel whose depth contains
+        # information from this keyframe (`inherited` (H, W))
         self._lateral_m = [self._lateral_m[0] + patch.lateral_m, self._lateral_m[1] + 1]
         height = patch.height_m
         if successor is not None and inherited is not None:
@@ -123,10 +121,8 @@ def _taken(layers: NDArray[Any], which: NDArray[np.int64]) -> Any:
 
 
 def _isolated(height: Map, other: Map) -> Mask:
-    """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis, not the chosen one.
-
-    Of at least five known neighbours, fewer than `_NEIGHBOURS_AT_CORNER` are nearer to `height`: usually a mismatch.
-    """
+    """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis, not the chosen one."""
+    # of at least five known neighbours, few are nearer to `height`: usually a mismatch
     around = np.lib.stride_tricks.sliding_window_view(np.pad(height, 1, constant_values=np.nan), (3, 3))
     known, agreeing = np.zeros(height.shape, np.int8), np.zeros(height.shape, np.int8)
     for i, j in _NEIGHBOURS:

@@ -68,10 +68,8 @@ def footprint_tiles(
 
 
 def steps_between(step_cov: Array, keyframes: NDArray[np.int64]) -> Array:
-    """Returns the covariance (m, 6, 6) of each chosen keyframe (m,), m > 0, relative to the chosen one before.
-
-    It sums `step_cov` (n, 6, 6) without lever arms, as nothing is propagated between keyframes that are far apart.
-    """
+    """Returns the covariance (m, 6, 6) of each chosen keyframe (m,), m > 0, relative to the chosen one before."""
+    # without lever arms, as nothing is propagated between keyframes that are far apart
     first, until = step_cov[keyframes[:1]], step_cov[: keyframes[-1] + 1]
     if len(keyframes) == 1:
         return first

@@ -13,21 +13,16 @@ _ONE_WAY = 0.2  # share of the keyframes in one of two directions below which a 
 
 
 def flown_back(positions_m: Array) -> NDArray[np.bool_]:
-    """Returns which keyframes (n,) at positions (n, 3) are on legs back, or every other one if there are no such legs.
-
-    Legs there and back show a point at different field angles, where errors of distortion and pose differ.
-    """
+    """Returns which keyframes (n,) at positions (n, 3) are on legs back, or every other one without such legs."""
+    # legs there and back show a point at different field angles, where errors of distortion and pose differ
     step_m = np.gradient(positions_m, axis=0)
     back = step_m @ np.linalg.svd(step_m, full_matrices=False)[2][0] < 0
     return back if _ONE_WAY <= back.mean() <= 1 - _ONE_WAY else np.arange(len(back)) % 2 == 1
 
 
 def with_scatter(elevation: ElevationMap, one: ElevationMap, other: ElevationMap) -> ElevationMap:
-    """Returns a map with the RMS difference / standard deviation of heights from two sets of keyframes, on its grid.
-
-    If it is above 1, the standard deviations are multiplied by it, the scale factor of Birge (Phys. Rev. 40, 207,
-    1932). Unchanged with fewer than `MIN_COMMON` common cells.
-    """
+    """Returns a map with the RMS difference / standard deviation of heights from two sets of keyframes, on its grid."""
+    # it multiplies the standard deviations if above 1: the scale factor of Birge (Phys. Rev. 40, 207, 1932)
     ratio = (one.height_m - other.height_m) / np.hypot(one.sigma_m, other.sigma_m)
     if np.isfinite(ratio).sum() < MIN_COMMON:
         return elevation

@@ -59,10 +59,8 @@ def build_map(
     pattern: Map = _NO_PATTERN,
     calibration: CalibrationEstimate = EXACT,
 ) -> ElevationMap:
-    """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far.
-
-    Depths are corrected for the errors of `calibration`; what remains uncertain is part of the standard deviations.
-    """
+    """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far."""
+    # depths are corrected for the calibration; what remains uncertain of it is part of the standard deviations
     rig = replace(rig, baseline_m=rig.baseline_m * (1 + calibration.baseline_error))
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
     poses, old = path.world_from_camera, None
@@ -89,11 +87,8 @@ def build_map(
 def with_calibration_sigma(
     found: ElevationMap, poses: Array, rig: StereoRig, calibration: CalibrationEstimate
 ) -> ElevationMap:
-    """Returns the map with the uncertainty of the calibration in its standard deviations.
-
-    A yaw e changes a depth Z = b / d by -Z^2 e / b at the image centre, a baseline error e by Z e. These errors are the
-    same in all keyframes, so that they do not average out. Z is taken from the mean height of the cameras.
-    """
+    """Returns the map with the uncertainty of the calibration, common to all keyframes, in its standard deviations."""
+    # a yaw e changes a depth Z = b / d by -Z^2 e / b at the image centre, a baseline error e by Z e
     if not calibration.cov.any():
         return found
     depth_m = float(np.mean(poses[:, 2, 3])) - found.height_m.astype(np.float64)

@@ -70,10 +70,8 @@ def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid
 
 
 def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
-    """Returns the heights (rows, cols) [m] of a map at the pixels of a grid that divide its cells, by interpolation.
-
-    Small holes of the map have the height of the nearest mapped cell; other holes and pixels outside are NaN.
-    """
+    """Returns the heights (rows, cols) [m] of a map at the pixels of a grid that divide its cells, by interpolation."""
+    # small holes have the height of the nearest mapped cell; other holes and pixels outside are NaN
     grid, n = elevation.grid, round(elevation.grid.cell_m / part.cell_m)
     first = np.array([grid.north_m - part.north_m, part.west_m - grid.west_m]) / grid.cell_m
     row, col = np.floor(first + 1e-6).astype(int) - _FILLED_CELLS - 1

@@ -39,11 +39,9 @@ def open_gates() -> ReadingGates:
 
 @kernel
 def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, sensor):
-    """Updates a pose (4, 4) and covariance (6, 6) with a reading unless its chi-square is too high; returns if used.
-
-    If many readings in succession contradict the pose alike, and it was predicted for a while since they agreed, its
-    covariance is increased by that of the implied error.
-    """
+    """Updates a pose (4, 4) and covariance (6, 6) with a reading unless its chi-square is too high; returns if used."""
+    # many readings in succession that contradict the pose alike, predicted for a while since they agreed, increase its
+    # covariance by that of the implied error
     counts, last, n = gates.counts[sensor], gates.residuals[sensor], len(residual)
     innovation_cov = geometry.product(geometry.product(jacobian, prior), jacobian.T) + cov
     if _chi2(residual, innovation_cov) > _READING_GATES[n - 1]:

@@ -82,10 +82,8 @@ def match_densely(left: Image | Map, right: Image | Map) -> DenseMatch:
 
 
 def search_range(left: Image, right: Image) -> tuple[int, int]:
-    """Returns the smallest and the largest disparity to search in images (H, W) of normalised contrast [px].
-
-    They are found in reduced images, at a fiftieth of the time; the whole range if too few pixels match there.
-    """
+    """Returns the smallest and the largest disparity to search in images (H, W) of normalised contrast [px]."""
+    # found in reduced images, at a fiftieth of the time; the whole range if too few pixels match there
     widest_px = int(MAX_DISPARITY_FRACTION * left.shape[1])
     size = left.shape[1] // _REDUCTION, left.shape[0] // _REDUCTION
     small_left, small_right = (
@@ -101,11 +99,9 @@ def search_range(left: Image, right: Image) -> tuple[int, int]:
 
 
 def search(left: Image, right: Image, range_px: tuple[int, int], speckle_px: int = SPECKLE_PX) -> Map:
-    """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown.
-
-    The images (H, W) have normalised contrast. They are padded on the left; otherwise the left margin, as wide as the
-    largest disparity searched (their number is a multiple of 16), would have no disparity.
-    """
+    """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown."""
+    # images (H, W) of normalised contrast, padded on the left: otherwise the left margin, as wide as the largest
+    # disparity searched (their number is a multiple of 16), would have no disparity
     low, high = range_px
     count = -(-max(high - low, 1) // 16) * 16
     matcher = cv2.StereoSGBM.create(

@@ -157,11 +157,9 @@ def _correlations(residual: Map, visible: Mask, variance: float) -> tuple[float,
 
 
 def _locking_factor(residual: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor, 0 to 1, by which the correlation of the noise of neighbouring pixels reduces pixel locking.
-
-    With the correlation c between neighbours in a column, which stereo does not interpolate, interpolation halfway
-    multiplies the variance of noise by 1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3); the result is the parenthesis.
-    """
+    """Returns the factor, 0 to 1, by which the correlation of noise of neighbouring pixels reduces pixel locking."""
+    # with the correlation c between neighbours in a column, which stereo does not interpolate, interpolation halfway
+    # multiplies the variance of noise by 1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3): the parenthesis
     c = float(np.clip(_correlations(residual, visible, variance)[1], 0.0, 1.0))
     return max(1 - 1.367 * c + 0.391 * c * c - 0.022 * c**3, 0.0)
 

@@ -115,11 +115,8 @@ class InertialFilter:
 
 @kernel
 def _propagate(pose, state, cov, last_s, last_rate, last_force, times_s, rates, forces, noise, is_gap):
-    """Returns pose (4, 4), state (12,) [velocity, gravity, biases] and covariance (18, 18) at the last reading.
-
-    Rates and forces are linear between readings: the mean of two is held, and the motion is of second order. White
-    noise of density s adds s^2 dt.
-    """
+    """Returns pose (4, 4), state (12,) [velocity, gravity, biases] and covariance (18, 18) at the last reading."""
+    # the mean of two readings is held between them, the motion is of second order; white noise of density s adds s^2 dt
     state = state.copy()
     for k in range(len(times_s)):
         dt = times_s[k] - last_s

@@ -41,11 +41,9 @@ class LinearisedObservations(NamedTuple):
 
 @kernel
 def change_by_yaw(points: Array) -> Array:
-    """Returns the change (n, 3) of normalised (x, y, disparity) of a stereo pair per yaw of the right camera [rad].
-
-    At the normalised column x of the right image, the column changes by -(1 + x^2) and the row by -x y (Hartley &
-    Zisserman 2004, section 6.1); the constraint of equal rows takes the mean of both rows.
-    """
+    """Returns the change (n, 3) of normalised (x, y, disparity) of a stereo pair per yaw of the right camera [rad]."""
+    # at column x of the right image, -(1 + x^2) in the column and -x y in the row (Hartley & Zisserman 2004, section
+    # 6.1); the constraint of equal rows takes the mean of both rows
     change = np.zeros((len(points), 3))
     for i in range(len(points)):
         x = points[i, 0] - points[i, 2]

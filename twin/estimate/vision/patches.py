@@ -83,10 +83,9 @@ def match_templates(
 ) -> PatchMatches:
     """Matches patches of one image in another, from the coarsest common level of the pyramids down to the full image.
 
-    Args:
-        templates, target: patches and spline coefficients per pyramid level.
-        guess: (n, 2) expected positions in the target [px]; accurate to about two pixels of the coarsest level.
-        warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
+    `templates` and `target` are patches and spline coefficients per pyramid level, `guess` (n, 2) expected positions in
+    the target [px], accurate to about two pixels of the coarsest level, `warp` (n, 2, 2) the derivative of target
+    pixels with respect to source pixels over each patch.
     """
     points, warp = guess.astype(np.float64), np.ascontiguousarray(warp)  # one memory layout: `_match` is compiled once
     correlation, cov = np.full(len(guess), -1.0), np.zeros((len(guess), 2, 2))
@@ -259,10 +258,8 @@ def _sample(spline, u0, v0, warp, half, values):
 
 @kernel(fastmath=_REASSOCIATE)
 def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance):
-    """Matches patches at one pyramid level, in its pixels, until a step (|column| + |row|) is below `tolerance`.
-
-    Returns positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zeros where it failed.
-    """
+    """Matches patches at one pyramid level, in its pixels, until a step (|column| + |row|) is below `tolerance`."""
+    # gives positions (n, 2), correlations (n,), covariances (n, 2, 2); the guess, -1 and zeros where it failed
     n = (2 * half + 1) ** 2
     height, width = spline.shape
     count = len(guess)
