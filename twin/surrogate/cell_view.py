@@ -166,13 +166,10 @@ def pose_variances(cells, index, position_m, cov):
 def extend_runs(runs, index, border_px, information, following, squared_step):
     """Adds a keyframe to the runs of consecutive keyframes that observe its cells `index` (n,), ascending.
 
-    Returns the positions (m,) in `index` of the cells that the next keyframe, with the cells `following`, does not
-    see, and the runs (4, m) of these, which end.
-
-    Args:
-        runs: (4, rows * cols) number of keyframes, sum of the squared distances between neighbours, largest distance
-            from the border of the images and sum of `information`; 0 for cells whose run has ended.
-        squared_step: squared distance to the next keyframe.
+    Returns the positions (m,) in `index` of the cells that the next keyframe, with the cells `following` at a squared
+    distance `squared_step`, does not see, and the runs (4, m) of these, which end. `runs` (4, rows * cols) are number
+    of keyframes, sum of the squared distances between neighbours, largest distance from the border of the images and
+    sum of `information`; 0 for cells whose run has ended.
     """
     ended, n, k = np.empty(len(index), np.int64), 0, 0
     for at in range(len(index)):

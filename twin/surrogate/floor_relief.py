@@ -64,16 +64,12 @@ def step_slope(height_m: Array, cell_m: float) -> Map:
 def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
     """Returns the strength of the edges (rows, cols) [px^(1/2)], which determines the errors near walls.
 
-    It is the square root of r s, and 0 where the matching window of the cell shows no wall. The slope s of the cell, at
-    least `_LEAST_SLOPE`, counts because a lateral displacement of the matched edge causes a height error on the face of
-    the wall, and hardly any on the level floor next to the wall. r is the geometric mean of the roughness of the cell
-    and of the largest roughness of the windows that contain the cell: the error is large if the window of the cell
-    shows two surfaces, or if the cell is matched as its neighbours are. The square root is taken because dense matching
-    resolves large structures better.
-
-    Args:
-        roughness_px: (rows, cols) `roughness` [px of disparity].
-        slope: (rows, cols) `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
+    It is the square root of r s, and 0 where the matching window of the cell shows no wall, a cell steeper than
+    `WALL_SLOPE`. The `slope` s of the cell (`step_slope`), at least `_LEAST_SLOPE`, counts because a lateral
+    displacement of the matched edge causes a height error on the face of the wall, and hardly any on the level floor
+    next to the wall. r is the geometric mean of `roughness_px` [px of disparity] of the cell and the largest of the
+    windows that contain it: the error is large if the window of the cell shows two surfaces, or if the cell is matched
+    as its neighbours are. The square root is taken because dense matching resolves large structures better.
     """
     side = _odd(window_cells)
     near_wall = maximum_filter(slope, side) > WALL_SLOPE

@@ -60,17 +60,11 @@ class MapNoise(NamedTuple):
 
 
 class MapModel:
-    """Samples the height patch of each keyframe: true heights of the floor plus errors.
+    """Samples the height patch of each keyframe: true heights (rows, cols) of the floor plus errors.
 
-    Args:
-        height_m: (rows, cols) true height at the cell centres.
-        rig: believed calibration, at the scale of the matched images.
-        floor: the true floor, for ray casting.
-
-    Attributes:
-        seen: (rows, cols) mask of the cells that at least one keyframe observed; updated by `mark_seen`.
-        conditions: conditions of the latest height of each cell, (rows * cols,) each.
-        n_heights: (rows * cols,) number of heights that were fused into the cell.
+    `rig` is the believed calibration, at the scale of the matched images; rays are cast to the true `floor`. `seen`
+    (rows, cols) masks the cells that at least one keyframe observed; updated by `mark_seen`. Of each cell, (rows *
+    cols,), `conditions` are those of the latest height, and `n_heights` the number of fused heights.
     """
 
     def __init__(
@@ -135,14 +129,9 @@ class MapModel:
         """Samples the heights of the cells that a keyframe sees and the next one does not; None if it sees none.
 
         The keyframes must be passed in the order of the path: the consecutive keyframes that observed a cell determine
-        the standard deviation of its height and whether it has one.
-
-        Args:
-            following: cells that the next keyframe observes; None for the last one.
-            cov: (6, 6) covariance of the estimated pose, in camera axes.
-
-        Raises:
-            FloatingPointError: a height or a variance is not finite.
+        the standard deviation of its height and whether it has one. `following` are the cells of the next one, None:
+        there is none; `cov` (6, 6) is that of the estimated pose, in camera axes. Raises FloatingPointError if a height
+        or a variance is not finite.
         """
         if not len(observed.cells):
             return None

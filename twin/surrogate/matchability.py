@@ -253,13 +253,10 @@ def lamp_share(images: FloorImages, floor_lx: Radiance, depth_m: float) -> float
 
 
 def position_dependence(contrast: Radiance, noise: NDArray[np.float32]) -> PositionDependence:
-    """Returns the dependence of matching on the position; `NO_DEPENDENCE` if a block has no light or no noise.
-
-    Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The gradients of
-    an even texture are proportional to `FloorImages.contrast` (H, W, 3) of an even floor. The squares of
-    gradients and noise, `MatchedImages.noise`, are averaged over each block; the logarithm of the noise is smoothed by
-    a polynomial in the position.
-    """
+    """Returns the dependence of matching on the position; `NO_DEPENDENCE` if a block has no light or no noise."""
+    # light, veil and blur vary over the image, and with them gradients, as `FloorImages.contrast` (H, W, 3) of an even
+    # floor, and noise, `MatchedImages.noise`; their squares are averaged over each block, the logarithm of the noise is
+    # smoothed by a polynomial
     gradients, variance = (_block_means(matching.gray(image) ** 2) for image in (contrast, noise))
     if not gradients.min() > 1e-12 * gradients.max() or not variance.min() > 0:
         return NO_DEPENDENCE
@@ -309,14 +306,11 @@ def unevenness_px(
 ) -> Array:
     """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], an RMS over the planned area.
 
-    The unevenness of a patch is the RMS parallax relative to its best-fit plane, in pixels per unit of
-    baseline / depth: f rms(z) / depth, with z the height above that plane [m] and f the focal length [px]. Each patch
-    contributes at most `_LARGEST_UNEVENNESS` times the median over the patches, because the weights of the estimators
-    limit the influence of matches with large residuals.
-
-    Args:
-        locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
-            centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
+    The unevenness of a patch is the RMS parallax relative to its best-fit plane, in pixels per unit of baseline /
+    depth: f rms(z) / depth, with z the height above that plane [m] and f the focal length [px]. Each patch contributes
+    at most `_LARGEST_UNEVENNESS` times the median over the patches, because the weights of the estimators limit the
+    influence of matches with large residuals. `locate` maps fractions (..., 2) of the area along and across the legs,
+    -0.5 to 0.5 from its centre, to world (x, y) [m]; None: centred at the origin, legs along x.
     """
     focal_px, patch_px = scenario.believed_rig().binned(binning).focal_px, scenario.estimator_settings().patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)

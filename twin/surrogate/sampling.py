@@ -55,27 +55,23 @@ def sample_link(
 ):  # fmt: skip
     """Samples the motion between two keyframes: estimates it from points with sampled noise, as from matched points.
 
-    Standard deviations and covariances are in normalised coordinates.
+    Standard deviations and covariances are in normalised coordinates. The true `points` (n, 3) of the later keyframe
+    are normalised (x, y, disparity), the true poses (4, 4). `camera` is focal length, principal point x and y, image
+    width and height, margin along the border [px]; baseline [m]; table of the measured positions of true points
+    (`measured_view.ViewTable`).
 
-    Args:
-        points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
-        later_noise: (n, 3) standard normal samples of the later stereo pair's errors at these points.
-        earlier_noise: (rows, cols, 3) those of the earlier stereo pair's biases, on a raster over its image.
-        relief_noise: (f, f, 2) those of the errors due to relief; they repeat every f floor cells.
-        normals: (n + 1, 3) those of this link alone: n for its points, the last one for their common bias.
-        earlier_pose, later_pose: (4, 4) true poses.
-        camera: focal length, principal point x and y, image width and height, margin along the border [px]; baseline
-            [m]; table of the measured positions of true points (`measured_view.ViewTable`).
-        cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
-        error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
-        distance_growth: growth of the variance in the earlier pair with distance / depth.
-        common_sigma: standard deviation of the bias that all points of a link share.
-        noise_share: number of points divided by the number of matches that they represent: the variance of the mean of
-            independent matches that a point represents, divided by that of a single match.
+    Standard normal samples: `later_noise` (n, 3) of the later pair's errors at these points; `earlier_noise` (rows,
+    cols, 3) of the earlier pair's biases, on a raster over its image; `relief_noise` (f, f, 2) of the errors due to
+    relief, repeated every f floor cells; `normals` (n + 1, 3) of this link alone: its points, and the last one for the
+    bias of deviation `common_sigma` that they share.
 
-    Returns:
-        Number of points that both keyframes see; motion earlier_from_later (4, 4), its reported covariance (6, 6), and
-        the yaw of the right camera as `_yaw` gives it. The latter are valid only if at least `MIN_POINTS` are seen.
+    A point has in either pair the reported covariance `cov` (3, 3) and the Cholesky factor `error_root` (3, 3) of the
+    true one, whose variance in the earlier pair grows by `distance_growth` with distance / depth. `noise_share` is the
+    number of points divided by that of the matches they represent: the variance of the mean of independent matches that
+    a point represents, divided by that of a single match.
+
+    Returns the number of points that both keyframes see; motion earlier_from_later (4, 4), its reported covariance (6,
+    6), and the yaw of the right camera as `_yaw` gives it. The latter are valid only if at least `MIN_POINTS` are seen.
     """
     focal, cx, cy, width, height, margin, baseline, table = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_sigma

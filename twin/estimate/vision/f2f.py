@@ -49,21 +49,18 @@ class _Located(NamedTuple):
 class FrameToFrame:
     """Frame-to-frame motion by tracking the points of the last keyframe.
 
-    Every frame is matched with a reference image: the last keyframe, or a later frame once too few of the points are
-    tracked. Structure is estimated together with motion (`two_view_motion.pair_motion`); the motion between two frames
-    follows from their poses relative to the reference. If each frame were matched with the previous one and depth taken
-    as exact, as in eq. (2) of Negahdaripour & Madjidi (2003), matching errors would accumulate: the bias of pitch was
-    1.25 mrad over fine texture (this method: 0.1 +- 0.1 mrad) and 4 mrad over coarse texture (0.5 +- 0.7 mrad).
+    Every frame is matched with the image `reference` and its points: the last keyframe (None before the first one), or
+    a later frame once too few of the points are tracked. Structure is estimated together with motion
+    (`two_view_motion.pair_motion`); the motion between two frames follows from their poses relative to the reference.
+    If each frame were matched with the previous one and depth taken as exact, as in eq. (2) of Negahdaripour & Madjidi
+    (2003), matching errors would accumulate: the bias of pitch was 1.25 mrad over fine texture (this method: 0.1 +- 0.1
+    mrad) and 4 mrad over coarse texture (0.5 +- 0.7 mrad).
 
-    A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because the
-    acceleration of a vehicle is limited, whereas a pose from few and noisy pixels may have any error. With an IMU, it
-    predicts the motion (`inertial_filter`). A step fails if
-    too few points are tracked or agree, or if the measured pose contradicts the prediction; the predicted motion is
-    then returned, with a large covariance.
-
-    Attributes:
-        reference: image with which frames are matched, and its points; None before the first keyframe.
-        filter: pose of the last frame in the reference camera, and velocity.
+    A Kalman filter of pose in the reference camera and velocity (`motion_filter`) fuses the measured pose with the
+    prediction from the velocity, because the acceleration of a vehicle is limited, whereas a pose from few and noisy
+    pixels may have any error. With an IMU, it predicts the motion (`inertial_filter`). A step fails if too few points
+    are tracked or agree, or if the measured pose contradicts the prediction; the predicted motion is then returned,
+    with a large covariance.
     """
 
     def __init__(

@@ -27,11 +27,8 @@ class InertialFilter:
     visual-inertial odometry"). Between measured poses the IMU predicts the motion: w = w_m - b_w, dv/dt = f_m - b_f + g
     - w x v, dg/dt = -w x g. Direction of gravity and bias of the accelerometer start as unknown as they are; a motion
     is predicted as well as their sum is known. Errors (18,) are [rotation, translation (as `MotionFilter`), velocity,
-    gravity, bias of the rates, bias of the specific forces].
-
-    Attributes:
-        pose: (4, 4) pose of the camera at the last frame in the reference camera.
-        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
+    gravity, bias of the rates, bias of the specific forces]. `pose` and `velocity`, of the camera, are as those of
+    `MotionFilter`.
     """
 
     def __init__(self, rig: StereoRig, noise: ImuErrorModel, first: ImuReadings, velocity: Array):

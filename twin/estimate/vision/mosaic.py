@@ -184,9 +184,8 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
     """Linearises the brightness residuals (cell minus frame) of the n cells visible in the frame at a known depth.
 
-    Returns:
-        Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the depth
-        from the mosaic and from the frame; residuals (m,) and their image blocks; mask (n,) of the m cells used.
+    Returns Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the
+    depth from the mosaic and from the frame; residuals (m,) and their image blocks; mask (n,) of the m cells used.
     """
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS

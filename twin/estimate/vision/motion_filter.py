@@ -15,12 +15,10 @@ class MotionFilter:
     """Extended Kalman filter of the camera's pose in a reference camera and of its velocity, from frame to frame.
 
     Nearly constant velocity (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2): where the image determines a pose
-    poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. Errors of the pose
-    are motions [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
-
-    Attributes:
-        pose: (4, 4) pose of the last frame in the reference camera.
-        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
+    poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. `pose` (4, 4) is
+    that of the last frame in the reference camera, its errors are motions [rotation, translation] (rad, m) in the axes
+    of the camera: pose = true pose @ exp(error). `velocity` (6,) is the twist of the camera in its own axes [rad/s,
+    m/s].
     """
 
     def __init__(self, stops_if_blind: bool = True):

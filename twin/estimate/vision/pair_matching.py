@@ -30,9 +30,8 @@ class MatchedPair(NamedTuple):
 class PairMatcher:
     """Matches a node with earlier nodes, at the scale of the grey levels in `spool`, and estimates their motions.
 
-    Attributes:
-        removed_yaw: yaw of the right camera for which the images of a keyframe were corrected, by frame index [rad].
-        twists: twist of the camera (6,) at a keyframe, by frame index, for the correction of a rolling shutter.
+    By frame index of a keyframe, `removed_yaw` is the yaw of the right camera [rad] for which its images were
+    corrected, and `twists` the twist (6,) of the camera, for the correction of a rolling shutter.
     """
 
     def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
