@@ -41,7 +41,7 @@ from twin.estimate.blind_frames import BlindFrame, aligned, blind_frame
 from twin.estimate.calibration_errors import lasting_residuals, length_scales
 from twin.estimate.late_readings import ReadingsBetweenNodes, motion_since
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
-from twin.estimate.mapping.height_check import flown_back, with_scatter
+from twin.estimate.mapping.map_builder import flown_back, with_scatter
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
 from twin.estimate.navigation.pose_filter import DeadReckoningState, PoseFilter, clip_covariance
