@@ -127,11 +127,9 @@ def _draw_positions(solution: pose_graph.Solution) -> Array:
 
 
 def _independent_errors(draws: Array, covs: Array) -> float | None:
-    """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes.
-
-    Of 3 k squared normal numbers, the sum divided by k has the variance 6 / k. `draws` (n, 3, m) are errors drawn from
-    the joint covariance [m], `covs` (n, 3, 3) [m2]; None without a node of known covariance.
-    """
+    """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes."""
+    # of 3 k squared normal numbers, the sum / k has the variance 6 / k; `draws` (n, 3, m) of the joint covariance [m],
+    # `covs` (n, 3, 3) [m2]
     known = np.linalg.eigvalsh(covs)[:, 0] > 0
     if not known.any():
         return None

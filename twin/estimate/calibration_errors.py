@@ -31,8 +31,7 @@ from twin.estimate.navigation.dvl import body_displacement
 from twin.estimate.vision.stereo import Keyframe
 from twin.kernels import kernel
 
-#: Largest median standard deviation of the offset from a single link at which the offset counts as observable [px].
-MAX_LINK_SIGMA_PX = 0.3
+MAX_LINK_SIGMA_PX = 0.3  #: largest median sigma by a single link with which an offset is observable [px]
 _MOST_SIGMA = 0.1  # a scale with a larger standard deviation is not observed
 SIGNIFICANT = 4.0  #: standard deviations
 _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many times that of all sensors together

@@ -211,11 +211,9 @@ class KeyframeNetwork:
         return aligned.covs[-1]
 
     def align_all(self) -> Array | None:
-        """Aligns all nodes by the links in the network. Call `truncate` first, which adds the links in progress.
-
-        Returns, for each keyframe, the marginal covariance (6, 6) of the pose of the latest node up to it. None if the
-        alignment is switched off, abandoned or failed before, or with fewer than two nodes. Raises SurveyAborted.
-        """
+        """Aligns all nodes by the links in the network; call `truncate` first. Raises SurveyAborted."""
+        # returns, for each keyframe, the marginal covariance (6, 6) of the pose of the latest node up to it; None if
+        # switched off, abandoned or failed before, or with fewer than two nodes
         if not (self.settings.use_ga and self._alignable and len(self.nodes) >= 2):
             return None
         with self.stopwatch("ga"):
@@ -281,12 +279,9 @@ class KeyframeNetwork:
         return pattern if pattern * self.rig.focal_px > NOTICEABLE_PX else 0.0
 
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
-        """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
-
-        Older nodes that are linked to the given nodes are held fixed; they are the first ones of the result. Links
-        rejected as outliers are removed from the network. Marginal covariances are those of the nodes `marginals`,
-        None: all. Raises SurveyAborted.
-        """
+        """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on."""
+        # older nodes that are linked to them are held fixed, and are the first ones of the result; rejected links are
+        # removed; marginal covariances are those of the nodes `marginals`, None: all. Raises SurveyAborted.
         first = nodes[0].number
         links = self.links.select(self.links.j >= first)
         fixed = set(links.i[links.i < first].tolist())

@@ -151,16 +151,11 @@ def _mean_colour(albedo: Image) -> Image:
 class Matchability:
     """Cramér-Rao bound of image matching and unevenness of the true floor, tabulated over the range of floor depths.
 
-    Attributes:
-        depths_m: (m,) ascending depths of the floor along the optical axis [m].
-        binning: side of the squares of pixels that the estimators average to one pixel [px].
-        bounds_px: (m,) Cramér-Rao bound c at these depths [px of the binned images]; infinite where marine snow
-            prevents all matches.
-        dependence: dependence of the bound on the position in the image, at the medium depth.
-        texture: distribution of the bound over the windows of dense matching, at the medium depth.
-        unevenness_px: (m,) the result of `unevenness_px` at these depths.
-        lamp_share: fraction of the light reflected by the floor that comes from the lamps.
-        clear_share: (m,) fraction of the matches that remain in the presence of marine snow, at these depths.
+    At `depths_m` (m,) of the floor along the optical axis, ascending, `bounds_px` (m,) is the bound in images binned by
+    `binning`, infinite where marine snow prevents all matches; `unevenness_px` (m,) that of the function of this name;
+    `clear_share` (m,) the fraction of matches that marine snow leaves. At the medium depth, `dependence` is that of the
+    bound on the position, `texture` its distribution over the windows of dense matching. `lamp_share` is the fraction
+    of the reflected light that comes from the lamps.
     """
 
     @np.errstate(invalid="raise")

@@ -109,13 +109,10 @@ def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Ma
 def _compiled_loop(
     world: World, vehicle: CompiledVehicle, vision: SurrogateVision, navigator: Navigator, pilot: RovPilot
 ) -> FastForward:
-    """Returns a function that runs the compiled closed loop from a given frame up to the next keyframe.
-
-    It performs the same operations with the same random numbers as the loop in `survey.fly`, and returns the index of
-    the next frame to simulate: that of the next keyframe or, without one, the number of frames; the given one if F2F
-    has no points to track. If the physics diverges or the hull touches the floor, the frames up to the one after which
-    this was detected are recorded, and SurveyAborted is raised.
-    """
+    """Returns a function that runs the compiled closed loop from a given frame up to the next keyframe."""
+    # same operations and random numbers as `survey.fly`; it returns the next frame to simulate (a keyframe, the number
+    # of frames, or the given one if F2F has no points to track). If the physics diverges or the hull touches the floor,
+    # the frames up to the one after which this was detected are recorded, and SurveyAborted is raised.
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
     sensors, n_steps = world.sensors.per_frame, whole_timesteps(interval_s, vehicle.state.timestep_s)

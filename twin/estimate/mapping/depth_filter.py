@@ -14,8 +14,7 @@ from twin.kernels import kernel
 #: A measured depth z of variance R is accepted at a pixel where the filter has depth h of variance P if its innovation
 #: z - h satisfies (z - h)^2 < GATE (P + R). The value is the 99.9 % quantile of chi-square, one degree of freedom.
 GATE = 10.83
-#: Depth is not interpolated between neighbours whose disparities differ by more: they are on different surfaces [px].
-JUMP_PX = 1.2
+JUMP_PX = 1.2  #: neighbours whose disparities differ by more are on different surfaces [px]
 #: Standard deviation of depth from motion due to errors other than image noise and pose [px of stereo disparity].
 MOTION_MIN_SIGMA_PX = 0.03
 

@@ -13,10 +13,8 @@ from twin.core.threads import prefetched
 from twin.estimate.mapping.exposure_balance import estimated_factors, patch_colours, patch_points, reported_factors
 from twin.estimate.mapping.orthophoto import OrthoLayers, add_view, empty_layers, footprint
 
-#: Width of the margin around a tile: the floor in it is taken into account as it may hide pixels of the tile [px].
-_MARGIN_PX = 64
-#: Unmapped cells are filled up to this distance from mapped ones, so that small holes of the map have a colour [cells].
-_FILLED_CELLS = 3
+_MARGIN_PX = 64  # width of the margin around a tile, whose floor may hide pixels of the tile [px]
+_FILLED_CELLS = 3  # small holes of the map have a colour up to this distance from mapped cells [cells]
 
 
 class Views(NamedTuple):

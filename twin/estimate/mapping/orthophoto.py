@@ -19,11 +19,9 @@ from twin.kernels import kernel
 #: 17 pixels of an image with a focal length of 277 px.
 SHARPNESS = 240.0
 _SATURATED = 60.0  # added to -log w where a pixel of the image is saturated; -log w of a view 27 deg from nadir
-#: A view for which exp(-K tan^2(n)) is less than exp(-this) times the best weight so far is not added.
-_NEGLIGIBLE = 7.0
+_NEGLIGIBLE = 7.0  # a view for which exp(-K tan^2(n)) is less than exp(-this) times the best weight is not added
 _RAMP_PX, _LEAST_RAMP = 12.0, 1e-3  # width of the ramp at the border of the image, and its value at the border
-#: A pixel is hidden if floor that projects to the same pixel of the image is nearer by more than this fraction.
-_HIDDEN_SHARE = 0.02
+_HIDDEN_SHARE = 0.02  # a pixel is hidden if floor at the same pixel of the image is nearer by more than this fraction
 
 
 class OrthoLayers(NamedTuple):

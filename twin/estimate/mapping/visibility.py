@@ -8,8 +8,7 @@ from twin.core.records import Map, MapGrid, Mask
 from twin.estimate.mapping.depth_filter import GATE
 from twin.kernels import kernel
 
-#: Connected groups of cells of agreeing heights with at most this many cells are islands; larger ones are the surface.
-LARGEST_ISLAND = 400
+LARGEST_ISLAND = 400  #: connected cells of agreeing heights that are an island; larger groups are the surface
 #: A line of sight is blocked where it passes this many standard deviations below the surface, in a cell whose eight
 #: neighbours are known and as high.
 _SIGMAS = 3.0

@@ -116,12 +116,10 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
 @kernel
 def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
-    """Fuses the visual motion since the last reading with the DVL readings, and adds it to the integration.
-
-    The reading of this frame, `velocity` (3,) in body axes [m/s], is NaN if there is none. Returns a `MotionUpdate`,
-    `a_from_b` and `cov` unchanged if there is no reading, or if it contradicts the visual motion. The integration
-    becomes incomplete if it does, or if the last reading is too long ago.
-    """
+    """Fuses the visual motion since the last reading with the DVL readings, and adds it to the integration."""
+    # `velocity` (3,) of this frame in body axes [m/s], NaN without; motion and covariance are unchanged without one, or
+    # if it contradicts the visual motion. The integration becomes incomplete if it does, or if the last reading is too
+    # long ago.
     nothing = np.eye(4), np.zeros((6, 6))
     before, before_cov, motion, motion_cov, duration_s = nothing[0], nothing[1], a_from_b, cov, model.step_s
     if state.gap_s[0] > 0:

@@ -21,8 +21,7 @@ from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import StereoPoints
 
-#: Which estimates of pitch, yaw, roll and row offset are removed from the right images.
-CORRECTED = np.array([True, False, True, True])
+CORRECTED = np.array([True, False, True, True])  #: the estimates that are removed from right images
 #: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times those of a poor calibration.
 _PRIOR_SIGMA = np.array([0.02, 0.02, 0.02, 0.02])
 _SIGNIFICANT = 4.0  # smallest change of a row by an update of the correction [standard deviations]

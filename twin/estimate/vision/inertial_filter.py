@@ -7,8 +7,7 @@ from twin.core.geometry import Array
 from twin.core.records import GRAVITY_MPS2, ImuErrorModel, ImuReadings, StereoRig
 from twin.kernels import kernel
 
-#: Standard deviations at the first reading: velocity [m/s], and acceleration of the vehicle [m/s2].
-_FIRST_VELOCITY, _FIRST_ACCELERATION = 1.0, 0.3
+_FIRST_VELOCITY, _FIRST_ACCELERATION = 1.0, 0.3  # sigmas at the first reading [m/s], [m/s2]
 _GRAVITY_SIGMA = 0.01  # of the strength of gravity, which varies over the Earth by more, but is not known better [m/s2]
 #: Above the first chi2 (6 degrees of freedom) a measured pose has less weight, as errors of vision have heavier tails
 #: than those of the prediction; above the second it is rejected.

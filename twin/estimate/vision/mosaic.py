@@ -28,8 +28,7 @@ _BLOCKS = (6, 8)  # rows and columns of image blocks; a block is about as wide a
 #: Largest ratio of the 99th percentile and the median of depths: cells of the median's resolution would else have to
 #: cover more than 25 times the area of an image, as where a camera looks along a floor.
 _MOST_DEPTH_RATIO = 5.0
-#: Largest angle of the optical axis from straight down for which heights are measured along z of the world.
-_MAX_TILT_RAD = np.deg2rad(45.0)
+_MAX_TILT_RAD = np.deg2rad(45.0)  # of the optical axis from straight down, for heights along z of the world
 
 
 def viewing_plane(world_from_camera: Array) -> Array:
@@ -182,11 +181,9 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
 
 @kernel
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
-    """Linearises the brightness residuals (cell minus frame) of the n cells visible in the frame at a known depth.
-
-    Returns Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the
-    depth from the mosaic and from the frame; residuals (m,) and their image blocks; mask (n,) of the m cells used.
-    """
+    """Linearises the brightness residuals (cell minus frame) of the n cells visible in the frame at a known depth."""
+    # Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the depth
+    # from the mosaic and from the frame; residuals (m,) and their image blocks; mask (n,) of the m cells used
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS
     jacobian, frame_jacobian, residuals, block = np.empty((n, 6)), np.empty((n, 6)), np.empty(n), np.empty(n, np.int64)

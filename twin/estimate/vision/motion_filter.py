@@ -5,8 +5,7 @@ from twin.core.geometry import Array
 from twin.core.records import ImuReadings
 from twin.core.settings import braking_factor
 
-#: Standard deviation of the acceleration of an underwater vehicle [rotation, translation] (rad/s2, m/s2).
-_ACCELERATION = np.full(6, 2.0)
+_ACCELERATION = np.full(6, 2.0)  # sigma of an underwater vehicle [rotation, translation] (rad/s2, m/s2)
 _FIRST_VELOCITY = np.ones(6)  # standard deviation of the velocity before it is measured [rad/s, m/s]
 _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a measured pose; above it, the measurement is rejected
 

@@ -78,11 +78,8 @@ def normal_equations(jacobian, weight, residual):
 
 @kernel
 def transfer(points_b, a_from_b, baseline):
-    """Transfers points measured in pair b, normalised (x, y, disparity) (n, 3), to pair a.
-
-    Returns (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an increment
-    [rotation, translation] (rad, m) of the motion in the axes of b (n, 3, 6).
-    """
+    """Transfers normalised (x, y, disparity) (n, 3) from pair b to a; with derivatives by point and motion."""
+    # (n, 3, 3) by the point in b, (n, 3, 6) by an increment [rotation, translation] (rad, m) of the motion in its axes
     n = len(points_b)
     points_a, jacobian_point, jacobian_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
     rotation, translation = np.empty((3, 3)), np.empty(3)  # translation in baselines
@@ -153,11 +150,9 @@ def _invert(m, out):
 
 @kernel
 def motion_normal_equations(observations, weight):
-    """Returns the normal equations of the p unknowns of the motion, with the structure eliminated.
-
-    These are the normal matrix (p, p), the right-hand side (p,), and its derivative (p, 3) with respect to biases of x,
-    y and disparity in a that are the same at all points. Points of robust weight (n,) 0 are skipped.
-    """
+    """Returns the normal equations of the p unknowns of the motion, with the structure eliminated."""
+    # normal matrix (p, p), right-hand side (p,), and its derivative (p, 3) with respect to biases of x, y and disparity
+    # in a that are the same at all points; points of robust weight (n,) 0 are skipped
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
     count = jacobian.shape[2]
     normal, right, bias_jacobian = np.zeros((count, count)), np.zeros(count), np.zeros((count, 3))

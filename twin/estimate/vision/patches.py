@@ -110,12 +110,10 @@ def disparity_slope(disparity_px: Map, points: NDArray[np.floating], patch_px: i
 
 
 def locking_shifts(pixels: NDArray[np.floating], warp: Array, patch_px: int) -> Array:
-    """Returns the shifts (n, 2) [px] of positions `pixels` (n, 2) due to pixel locking with an amplitude of 1 px.
-
-    A match at column u and row v [px] is shifted by -A sin(2 pi u) and -A sin(2 pi v) (Schreier, Braasch & Sutton 2000,
-    Opt. Eng. 39). Where a patch of side s is warped (`match_templates`), its pixels' biases partly cancel: A along an
-    image axis is multiplied by sinc(s d1) sinc(s d2), with (d1, d2) the row for this axis of "warp minus identity".
-    """
+    """Returns the shifts (n, 2) [px] of positions `pixels` (n, 2) due to pixel locking with an amplitude of 1 px."""
+    # at column u and row v, -A sin(2 pi u) and -A sin(2 pi v) (Schreier, Braasch & Sutton 2000, Opt. Eng. 39); where a
+    # patch of side s is warped, its pixels' biases partly cancel: A along an image axis is multiplied by sinc(s d1)
+    # sinc(s d2), with (d1, d2) the row for this axis of "warp minus identity"
     varying = np.sinc(patch_px * (warp - np.eye(2)))
     return -np.sin(2 * np.pi * pixels) * varying[:, :, 0] * varying[:, :, 1]
 
