@@ -101,7 +101,7 @@ MUTANTS = [
         ("twin/imaging/camera/sensor.py", "self.share = 1 - np.exp(-1 / (frame_rate_hz * lag_s))", "self.share = np.exp(-1 / (frame_rate_hz * lag_s))", "imaging_sensor"),
         ("twin/imaging/camera/lens.py", "3 * lens.k1, 5 * lens.k2, 7 * lens.k3", "3 * lens.k1, 3 * lens.k2, 7 * lens.k3", "imaging_lens"),
         ("twin/imaging/light/backscatter.py", "return light * phase[..., None, :] * water.scattering_per_m", "return light * phase[..., None, :] * water.scattering_per_m / 2", "imaging_optics"),
-        ("twin/imaging/scene/sway.py", "vertices[:, 2] -= deflection**2 / (2 * height_m)", "vertices[:, 2] -= deflection**2 / height_m", "imaging_sway"),
+        ("twin/imaging/scene/object_view.py", "vertices[:, 2] -= deflection**2 / (2 * height_m)", "vertices[:, 2] -= deflection**2 / height_m", "imaging_sway"),
         ("twin/imaging/reference/directions.py", "low, high = (k / cells) ** 4, ((k + 1) / cells) ** 4", "low, high = (k / cells) ** 2, ((k + 1) / cells) ** 2", "imaging_reference imaging_photons"),
         # estimators
         ("twin/estimate/vision/motion_filter.py", "velocity * (interval_s**2 / 3), shared", "velocity * interval_s**2, shared", "estimate_motion_filter"),

@@ -9,7 +9,7 @@ import pytest
 from twin.core import geometry
 from twin.core.records import ElevationMap, MapGrid, Readings, SensorNoise, StereoRig
 from twin.estimate.calibration_errors import lasting_residuals
-from twin.estimate.mapping.height_check import MIN_COMMON, flown_back, with_scatter
+from twin.estimate.mapping.map_builder import MIN_COMMON, flown_back, with_scatter
 from twin.estimate.vision.image_errors import change_by_distortion
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.two_view_motion import pair_motion

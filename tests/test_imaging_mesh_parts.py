@@ -8,7 +8,7 @@ import pytest
 from twin.core import geometry, threads
 from twin.imaging.scene import mesh_raster
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
-from twin.imaging.scene.sway import swayed
+from twin.imaging.scene.object_view import swayed
 from twin.terrains.objects.coloured_mesh import Mesh, mesh_of
 from twin.terrains.objects.detail import PART_FACES, UNKNOWN, Parts, parts_of
 from twin.terrains.objects.placed_object import PlacedObject, model_of

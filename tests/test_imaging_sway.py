@@ -7,10 +7,9 @@ import pytest
 
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging.scene import sway
+from twin.imaging.scene import object_view
 from twin.imaging.scene.mesh_raster import NEAR_M, Projection, view_planes
-from twin.imaging.scene.object_view import Objects, draw_over_floor
-from twin.imaging.scene.sway import largest_displacement_m, swayed
+from twin.imaging.scene.object_view import Objects, draw_over_floor, largest_displacement_m, swayed
 from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.shapes import build_shape
 
@@ -52,17 +51,17 @@ def test_the_mean_deflection_of_the_tip_is_half_the_largest_at_half_a_metre_per_
     """Over one period of the eddies, width / (Strouhal number times speed), the oscillation averages to zero."""
     item, tip = plant(), PLANT.vertices_m[:, 2].argmax()
     width_m = item.scale * (KELP.high_m - KELP.low_m)[:2].max()
-    period_s = width_m / (sway.STROUHAL * 0.5)
+    period_s = width_m / (object_view.STROUHAL * 0.5)
     along = np.array([moved(item, CURRENT, t)[tip, :2] @ [0.6, -0.8] for t in np.arange(8) / 8 * period_s])
     height_m = item.scale * KELP.high_m[2]
-    assert along.mean() == pytest.approx(sway.LARGEST_LEAN / 2 * height_m, rel=1e-4)
-    assert np.ptp(along) == pytest.approx(2 * sway.OSCILLATION * along.mean(), rel=0.1)
+    assert along.mean() == pytest.approx(object_view.LARGEST_LEAN / 2 * height_m, rel=1e-4)
+    assert np.ptp(along) == pytest.approx(2 * object_view.OSCILLATION * along.mean(), rel=0.1)
     np.testing.assert_allclose(moved(item, CURRENT, 1.0), moved(item, CURRENT, 1.0 + period_s), atol=1e-5)
 
 
 @pytest.mark.parametrize("speed", (0.2, 1.0, 5.0))
 def test_the_largest_displacement_bounds_that_of_every_vertex(speed: float) -> None:
-    period_s = 2.0 * (KELP.high_m - KELP.low_m)[:2].max() / (sway.STROUHAL * 0.5 * speed)
+    period_s = 2.0 * (KELP.high_m - KELP.low_m)[:2].max() / (object_view.STROUHAL * 0.5 * speed)
     times_s = np.arange(30) / 30 * period_s
     most = max(np.linalg.norm(moved(plant(), CURRENT * speed, t), axis=1).max() for t in times_s)
     bound = largest_displacement_m(plant(), CURRENT * speed)
@@ -74,7 +73,7 @@ def test_the_bound_holds_for_a_plant_on_a_slope() -> None:
     current_mps, item = np.array([5.0, 0.0, 0.0]), plant()
     tilted = item.world_from_object @ geometry.pose(geometry.so3_exp(np.array([0.0, -0.7, 0.0])), np.zeros(3))
     item = item._replace(world_from_object=tilted)
-    period_s = 2.0 * (KELP.high_m - KELP.low_m)[:2].max() / (sway.STROUHAL * 5.0)
+    period_s = 2.0 * (KELP.high_m - KELP.low_m)[:2].max() / (object_view.STROUHAL * 5.0)
     most = max(np.linalg.norm(moved(item, current_mps, t), axis=1).max() for t in np.arange(30) / 30 * period_s)
     bound = largest_displacement_m(item, current_mps)
     assert 0.97 * bound < most < bound * (1 + 1e-5)
@@ -90,7 +89,7 @@ def test_a_plant_that_bends_into_the_view_is_drawn() -> None:
     outside_m = normal @ centre[:3] + offset + plant().radius_m
     item = plant(x_m=-outside_m / np.hypot(*normal[:2]) - 0.02)
     width_m = item.scale * (KELP.high_m - KELP.low_m)[:2].max()
-    time_s = 0.75 * width_m / (sway.STROUHAL * 5.0)  # the tip is farthest downstream
+    time_s = 0.75 * width_m / (object_view.STROUHAL * 5.0)  # the tip is farthest downstream
 
     def drawn(current_mps: np.ndarray) -> int:
         albedo, depth = np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 12.0, np.float32)

@@ -11,7 +11,7 @@ import twin
 from twin import survey
 from twin.core.records import Frame, Readings
 from twin.plugin.protocols import LEAST_PACE, MOST_OFFSET_M, Adaptation
-from twin.session.plugin_adaptation import PluginAdaptation
+from twin.session.path_adaptation import PluginAdaptation
 from twin.world.floor_following import FloorFollower
 from twin.world.mission import prepare
 from twin.world.mission_flight import Flight

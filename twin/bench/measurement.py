@@ -51,10 +51,8 @@ def child_ms(*arguments: str) -> float:
 
 
 def child_peak_mb(code: str) -> float:
-    """Returns the peak memory of Python that runs `code` [MB], of Linux; TwinError if it fails.
-
-    Not `ru_maxrss`, which is at least the memory of the parent.
-    """
+    """Returns the peak memory of Python that runs `code` [MB], of Linux; TwinError if it fails."""
+    # not `ru_maxrss`, which is at least the memory of the parent
     return float(_child("-c", f"{code}\nprint(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])")) / 1e3
 
 

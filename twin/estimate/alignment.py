@@ -52,15 +52,10 @@ def align(
 ) -> AlignmentResult:
     """Returns the maximum-likelihood poses of a window of nodes, their covariances, and the links removed as outliers.
 
-    Args:
-        nodes: nodes of the window; their poses are the initial values.
-        anchors: prior covariance (6, 6) [rotation, translation] (rad, m) of each anchored node, by node number; the
-            prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
-        marginals_of: numbers of the nodes whose covariance is computed; all if None.
-        measured: errors of the calibration that are estimated together with the poses.
-
-    Raises:
-        LinAlgError: the links, anchors and sensor readings do not constrain every node.
+    The poses of the nodes are the initial values; `anchors` are prior covariances (6, 6) [rotation, translation] (rad,
+    m) about them by node number, also of nodes that are not in the window. Covariances are those of the nodes
+    `marginals_of`, None: all. The errors `measured` of the calibration are estimated together with the poses. Raises
+    LinAlgError if the links, anchors and sensor readings do not constrain every node.
     """
     links, dropped = Links.from_sequence(links), list[Link]()
     displacements = [kind for kind in [aiding.displacement_factors(nodes, rig)] if len(kind.i)]
@@ -112,10 +107,8 @@ def _motion_factors(nodes: Sequence[Keyframe], links: Links, shared: SharedParam
 
 
 def _outliers(graph: pose_graph.FactorGraph, chi2: Array) -> Mask:
-    """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
-
-    Not those below 1 % of the largest, which may have distorted them, nor those between consecutive nodes.
-    """
+    """Returns a mask (n,) of the links to remove, by the squared norms `chi2` (n,) of their whitened residuals."""
+    # not those below 1 % of the largest, which may have distorted them, nor those between consecutive nodes
     motions = graph.binary[0]
     chi2 = np.where(motions.j - motions.i == 1, 0.0, chi2)
     return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))
@@ -134,11 +127,9 @@ def _draw_positions(solution: pose_graph.Solution) -> Array:
 
 
 def _independent_errors(draws: Array, covs: Array) -> float | None:
-    """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes.
-
-    Of 3 k squared normal numbers, the sum divided by k has the variance 6 / k. `draws` (n, 3, m) are errors drawn from
-    the joint covariance [m], `covs` (n, 3, 3) [m2]; None without a node of known covariance.
-    """
+    """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes."""
+    # of 3 k squared normal numbers, the sum / k has the variance 6 / k; `draws` (n, 3, m) of the joint covariance [m],
+    # `covs` (n, 3, 3) [m2]
     known = np.linalg.eigvalsh(covs)[:, 0] > 0
     if not known.any():
         return None

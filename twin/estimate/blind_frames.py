@@ -63,10 +63,8 @@ def aligned(
 
 
 def _weighted(frames: Sequence[BlindFrame]) -> list[BlindFrame]:
-    """Returns frames whose guessed motions have variances that grow with the square of the time since the first one.
-
-    The velocity of a vehicle changes gradually, so the first guesses are good. The sum of the variances stays.
-    """
+    """Returns frames whose guessed motions have variances that grow with the square of the time since the first one."""
+    # the velocity of a vehicle changes gradually, so the first guesses are good; the sum of the variances stays
     growth = 3 * ((np.arange(len(frames)) + 0.5) / len(frames)) ** 2
     return [
         frame._replace(cov=factor * frame.cov) if frame.guessed else frame

@@ -31,8 +31,7 @@ from twin.estimate.navigation.dvl import body_displacement
 from twin.estimate.vision.stereo import Keyframe
 from twin.kernels import kernel
 
-#: Largest median standard deviation of the offset from a single link at which the offset counts as observable [px].
-MAX_LINK_SIGMA_PX = 0.3
+MAX_LINK_SIGMA_PX = 0.3  #: largest median sigma by a single link with which an offset is observable [px]
 _MOST_SIGMA = 0.1  # a scale with a larger standard deviation is not observed
 SIGNIFICANT = 4.0  #: standard deviations
 _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many times that of all sensors together
@@ -41,10 +40,7 @@ _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many
 def disparity_offset(
     offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int, n_views: float, focal_px: float
 ) -> DisparityOffset | None:
-    """Returns the weighted mean (`weighted_mean`) of the offsets of the links.
-
-    None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`).
-    """
+    """Returns the `weighted_mean` of the offsets of the links; None without offsets or nodes, or if not observable."""
     if not offsets or n_nodes < 1 or np.median([offset.sigma for offset in offsets]) * focal_px > MAX_LINK_SIGMA_PX:
         return None
     return DisparityOffset(*weighted_mean(offsets, n_nodes, n_views))
@@ -71,10 +67,8 @@ def weighted_mean(
 def row_pattern(
     epipolar: EpipolarError, calibration: CalibrationEstimate, offset: DisparityOffset | None, rig: StereoRig
 ) -> float:
-    """Returns the RMS of the systematic row difference that no rotation of a camera explains [focal lengths].
-
-    A yaw by the rows that the motions exclude (`contradicts`) is a distortion.
-    """
+    """Returns the RMS of the systematic row difference that no rotation of a camera explains [focal lengths]."""
+    # a yaw by the rows that the motions exclude is a distortion
     yaw_rad = float(epipolar.estimate[1]) - calibration.yaw_rad
     if not contradicts(offset, yaw_rad):
         return epipolar.pattern

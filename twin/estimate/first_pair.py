@@ -45,10 +45,8 @@ class FloorPlane(NamedTuple):
 
     @property
     def world_from_camera(self) -> Array:
-        """Returns the pose (4, 4) of the camera in a world whose plane z = 0 is the floor plane.
-
-        The origin is the foot of the perpendicular from the camera; x is that of the camera, projected onto the plane.
-        """
+        """Returns the pose (4, 4) of the camera in a world whose plane z = 0 is the floor plane."""
+        # the origin is the foot of the perpendicular from the camera, x that of the camera, projected onto the plane
         along = np.array([1.0, 0, 0]) - self.normal[0] * self.normal
         x = along / np.linalg.norm(along)
         rotation: Array = np.stack([x, np.cross(self.normal, x), self.normal]).astype(np.float64)

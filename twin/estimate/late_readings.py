@@ -21,11 +21,8 @@ _MOST_ADDED = 0.5
 
 
 def motion_since(log: PoseLog, time_s: float, end: int | None = None) -> tuple[Array, Array]:
-    """Returns the motion (4, 4) from a time to a frame and its covariance (6, 6), by the steps of a log.
-
-    Between frames, the motion is uniform; a time outside those of the frames counts as that of the nearest one. `end`
-    is the row of the frame, the last one by default; the log must not be empty.
-    """
+    """Returns the motion (4, 4) from a time to the frame in row `end` of a non-empty log, and its covariance (6, 6)."""
+    # the motion is uniform between frames; a time outside those of the frames counts as that of the nearest one
     times_s = log.times_s.array[: None if end is None else end + 1]
     time_s = float(np.clip(time_s, times_s[0], times_s[-1]))
     at = int(np.searchsorted(times_s, time_s - _SAME_S))  # the first frame that is not before the time

@@ -24,11 +24,8 @@ _NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
-    """Returns the overlap (n,), 0 to 1, of a node with the left image at each of the poses (n, 4, 4).
-
-    It is the fraction of the node's matched points that project into the other image, at least half a patch from its
-    border; 0 without points. It is predicted from poses and depths, without the assumption of a flat floor.
-    """
+    """Returns the fraction (n,) of a node's matched points that project into the left image at the poses (n, 4, 4)."""
+    # at least half a patch from its border; 0 without points
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
     xyz, position = node.points.xyz, node.world_from_camera[:3, 3].copy()
@@ -123,9 +120,7 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
 
 
 def floor_share(motion: Motion) -> float:
-    """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1.
-
-    1 - 1 / r^2 with r the relative residual (`Motion.residual`); 0 if r does not exceed 1 by two standard errors.
-    """
+    """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1."""
+    # 1 - 1 / r^2 with r the relative residual; 0 if r does not exceed 1 by two standard errors
     limit = 1 + 2 * _RESIDUAL_STANDARD_ERROR / max(motion.n_points, 1) ** 0.5
     return 1 - motion.residual**-2 if motion.residual > limit else 0.0

@@ -145,13 +145,9 @@ class KeyframeNetwork:
     ) -> None:
         """Adds a node and starts the measurement of its links to earlier nodes other than the last one.
 
-        Args:
-            chain: link from the last node (`link_to_last_node`).
-            bridge: F2F motion since the last node, fused with the DVL, in place of a chain that could not be measured.
-            displacement: displacement since the last node, measured by the DVL; None if it was not measured.
-
-        Raises:
-            OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
+        `chain` is the link from the last node (`link_to_last_node`), `bridge` the F2F motion since then, fused with the
+        DVL, in place of one that could not be measured; `displacement` is that by the DVL, None if not measured. Raises
+        OSError if images could not be read or written; the network is then incomplete and `align_all` returns None.
         """
         with self.stopwatch("network"):
             first = bisect_left(self.nodes, node.track - self.settings.window_tracks, key=lambda k: k.track)
@@ -173,10 +169,8 @@ class KeyframeNetwork:
         self._node_poses[n] = node.world_from_camera
 
     def _collect_links(self, all_but: int = 0) -> None:
-        """Adds the links of pending nodes to the network, oldest first, until at most `all_but` nodes are pending.
-
-        After any error of a measurement, nothing is pending, the network is incomplete and `align_all` returns None.
-        """
+        """Adds the links of pending nodes to the network, oldest first, until at most `all_but` nodes are pending."""
+        # after any error of a measurement, nothing is pending, and the network is incomplete
         while len(self._pending) > all_but:
             measure, chain, bridge = self._pending[0]
             try:
@@ -217,11 +211,9 @@ class KeyframeNetwork:
         return aligned.covs[-1]
 
     def align_all(self) -> Array | None:
-        """Aligns all nodes by the links in the network. Call `truncate` first, which adds the links in progress.
-
-        Returns, for each keyframe, the marginal covariance (6, 6) of the pose of the latest node up to it. None if the
-        alignment is switched off, abandoned or failed before, or with fewer than two nodes. Raises SurveyAborted.
-        """
+        """Aligns all nodes by the links in the network; call `truncate` first. Raises SurveyAborted."""
+        # returns, for each keyframe, the marginal covariance (6, 6) of the pose of the latest node up to it; None if
+        # switched off, abandoned or failed before, or with fewer than two nodes
         if not (self.settings.use_ga and self._alignable and len(self.nodes) >= 2):
             return None
         with self.stopwatch("ga"):
@@ -247,10 +239,7 @@ class KeyframeNetwork:
         self.links = self.links.select(self.links.j < len(self.keyframes))
 
     def yaw_rad(self, *latest: YawEffect) -> tuple[float, float]:
-        """Returns the yaw of the right camera by all links so far and by the calibration, and its sigma [rad].
-
-        `latest` are those of links that are not yet in the network.
-        """
+        """Returns yaw and sigma [rad] of the right camera by calibration, links, and `latest` not yet among them."""
         pending = [attempt.yaw for _, chain, _ in self._pending for attempt in chain if attempt.yaw is not None]
         yaws, n_nodes = [*self.history.yaws, *pending, *latest], len(self.nodes) - 1 + len(latest)
         return fused(self.rig.yaw_sigma_rad, self.disparity_offset(yaws, n_nodes, self.nodes[-_VIEWED_NODES:]))
@@ -258,10 +247,7 @@ class KeyframeNetwork:
     def disparity_offset(
         self, offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int, viewed: Sequence[Keyframe] | None = None
     ) -> DisparityOffset | None:
-        """Returns the mean of the offsets of links (`calibration_errors.disparity_offset`).
-
-        The number of views of a point is that by the nodes `viewed`, by default by all nodes.
-        """
+        """Returns the mean offset of links (`calibration_errors`); `viewed` are the nodes of the views, None: all."""
         if not offsets:
             return None
         n_views = self._mean_views(self.nodes if viewed is None else viewed)
@@ -293,12 +279,9 @@ class KeyframeNetwork:
         return pattern if pattern * self.rig.focal_px > NOTICEABLE_PX else 0.0
 
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
-        """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
-
-        Older nodes that are linked to the given nodes are held fixed; they are the first ones of the result. Links
-        rejected as outliers are removed from the network. Marginal covariances are those of the nodes `marginals`,
-        None: all. Raises SurveyAborted.
-        """
+        """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on."""
+        # older nodes that are linked to them are held fixed, and are the first ones of the result; rejected links are
+        # removed; marginal covariances are those of the nodes `marginals`, None: all. Raises SurveyAborted.
         first = nodes[0].number
         links = self.links.select(self.links.j >= first)
         fixed = set(links.i[links.i < first].tolist())

@@ -42,7 +42,7 @@ from twin.estimate.blind_frames import BlindFrame, aligned, blind_frame
 from twin.estimate.calibration_errors import lasting_residuals, length_scales
 from twin.estimate.late_readings import ReadingsBetweenNodes, motion_since
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
-from twin.estimate.mapping.height_check import flown_back, with_scatter
+from twin.estimate.mapping.map_builder import flown_back, with_scatter
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
 from twin.estimate.navigation.pose_filter import DeadReckoningState, PoseFilter, clip_covariance
@@ -219,12 +219,9 @@ class Navigator:
         return _Blindness(blind.state, range(blind.rows.start, row + 1), blind.motion @ motion.a_from_b)
 
     def _after_blindness(self, blind: _Blindness, motion: Motion, frame: Frame) -> tuple[Motion, Frame, float]:
-        """Returns to the state before the blind frames, as tracking measures the whole motion since then.
-
-        Returns this motion, the frame without the velocity of the DVL, which is that of the last interval, and the
-        interval [s]. What the sensors corrected meanwhile refers to predicted motions; with the measured one, it would
-        count twice.
-        """
+        """Returns to the state before the blind frames; returns the motion and time [s] since then, and the frame."""
+        # the frame loses the velocity of the DVL, which is that of the last interval; what the sensors corrected
+        # meanwhile refers to predicted motions, and would count twice with the measured one
         self.filter.state = blind.state
         self.filter.dvl.interrupt()
         start_s = float(self.log.times_s.array[max(blind.rows.start - 1, 0)])
@@ -256,11 +253,9 @@ class Navigator:
         return self.network.overlap(self.network.keyframes[-1], next_pair) < self.settings.keyframe_overlap
 
     def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
-        """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
-
-        Returns `status`, or the reason why the frame did not become a keyframe; only position fixes are then fused.
-        With `settings.wide_search`, "ok" if the link from the last node measures the motion although tracking failed.
-        """
+        """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking."""
+        # returns `status`, or why the frame did not become a keyframe (only position fixes are then fused); with
+        # `wide_search`, "ok" if the link from the last node measures the motion although tracking failed
         points = self.vision.observe_stereo(frame, len(self.log))
         if points is None:
             self.filter.fuse_position_fixes(frame.readings)
@@ -308,11 +303,9 @@ class Navigator:
             keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
 
     def _follow_chain(self, node: Keyframe, chain: Link) -> None:
-        """Replaces the F2F motion since the last node by the more accurate link; corrections since then are kept.
-
-        After blind frames, of the corrections before them only the part is kept that belongs to the pose of the last
-        node; the rest belongs to the replaced motion, which may be far less certain.
-        """
+        """Replaces the F2F motion since the last node by the more accurate link; corrections since then are kept."""
+        # after blind frames, only the part of those before them that belongs to the pose of the last node: the rest
+        # belongs to the replaced motion, which may be far less certain
         last = self.network.nodes[-1]
         if self._blind is not None:  # corrections since then refer to predicted motions
             self.filter.state = self._blind.state._replace(f2f=self.filter.f2f)
@@ -326,11 +319,8 @@ class Navigator:
         node.world_from_camera = self.filter.world_from_camera
 
     def _register_with_mosaic(self, keyframe: Keyframe, step_cov: Array) -> None:
-        """Corrects the online pose by registration with the mosaic (F2M).
-
-        The mosaic has the pose errors of its keyframes, so the correction is weighted by the covariance of the motion
-        since the keyframe that the compared cells come from; `step_cov` (6, 6) is that since the last node.
-        """
+        """Corrects the online pose by registration with the mosaic (F2M); `step_cov` (6, 6) is since the last node."""
+        # weighted by the covariance of the motion since the keyframe of the compared cells, whose pose errors they have
         pose = self.filter.world_from_camera
         self._accumulate(keyframe, step_cov)
         found = self.vision.register_with_mosaic(pose) if self.settings.use_f2m else None

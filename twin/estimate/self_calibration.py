@@ -44,11 +44,9 @@ class SharedParameters(NamedTuple):
     image_errors: bool = False
 
     def effect_on(self, links: Links) -> Effect | None:
-        """Returns the effect of the parameters on measured motions; None if there is none.
-
-        A longer baseline makes all lengths longer: those of the adjusted motions, as with the measured ones, a shorter
-        baseline would reduce the residuals.
-        """
+        """Returns the effect of the parameters on measured motions; None if there is none."""
+        # a longer baseline makes all lengths longer: those of the adjusted motions, as with the measured ones, a
+        # shorter baseline would reduce the residuals
         if YAW not in self.names and BASELINE not in self.names and not self.image_errors:
             return None
 

@@ -91,10 +91,8 @@ class _Damage(NamedTuple):
         return error * float(np.median(self.result.keyframe_depth_m)) / self.rig.baseline_m
 
     def _effects(self, error: float) -> Iterator[tuple[float, float, str]]:
-        """Yields the effects of an error e: depths Z = b / d, and all lengths, change by Z e / b.
-
-        An effect is the error of positions or of heights, its largest tolerable value [m], and both in words.
-        """
+        """Yields the effects of an error e (of positions or heights, largest tolerable one [m], both in words)."""
+        # depths Z = b / d, and all lengths, change by Z e / b
         result, _, elevation = self
         depth_m, share = float(np.median(result.keyframe_depth_m)), self._share(error)
         positions = result.final.positions[result.keyframe_rows]
@@ -220,10 +218,8 @@ def _distortion(k1: DistortionError, damage: _Damage) -> list[Finding]:
 
 
 def _scale(quality: EstimationQuality) -> list[Finding]:
-    """Returns a finding if lengths from the images differ from those of the navigation sensors.
-
-    The scale along the optical axis is judged only where that across it is right, as the rotation is wrong otherwise.
-    """
+    """Returns a finding if lengths from the images differ from those of the navigation sensors."""
+    # along the optical axis only where the scale across it is right, as the rotation is wrong otherwise
     for check, scale, which, cause in (
         ("length_scale", quality.length_scale, "", "the baseline or the scale of the sensors"),
         ("depth_scale", quality.depth_scale, " along the optical axis", "the baseline or the focal length"),

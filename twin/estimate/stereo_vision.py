@@ -48,14 +48,10 @@ _PATTERN_CHANGE = 0.2
 class StereoVision:
     """`Vision` from recorded or rendered stereo images, binned as `stereo.choose_binning` tells at the first keyframe.
 
-    Use as a context manager, or call `close`.
-
-    Args:
-        folder: folder for the images of keyframes and the tiles of the mosaic.
-        cell_m: cell size of the mosaic for images of full size [m]; for binned images it is multiplied by the binning.
-            By default, it is the ground sample distance of the first keyframe at full size.
-        stopwatch: function that returns a context manager which times the stage of a given name.
-        noise: noise of the navigation sensors, which tell a frozen camera from a vehicle at rest (`RepeatedImages`).
+    Use as a context manager, or call `close`. `folder` is for the images of keyframes and the tiles of the mosaic.
+    `cell_m`, multiplied by the binning, is the cell size of the mosaic [m], by default the ground sample distance of
+    the first keyframe at full size. `stopwatch` returns a context manager that times the stage of a given name. The
+    `noise` of the navigation sensors tells a frozen camera from a vehicle at rest (`RepeatedImages`).
     """
 
     runs_in_background = True  # matching takes long enough to justify a separate thread
@@ -159,10 +155,7 @@ class StereoVision:
             self.f2f.step(self._image, imu=imu)
 
     def _match_pair(self, left: Image, right: Image, row: int) -> tuple[Image, matching.Gray, DenseMatch, StereoPoints]:
-        """Matches a left image with a right one, from which known rectification errors are removed.
-
-        Returns the corrected right image, its grey levels at the image scale, its disparity, and points.
-        """
+        """Returns the right image without known rectification errors, its grey levels, disparity, and points."""
         right = self.calibration.rectify(right, self.full_rig)
         gray = matching.gray(right, self.binning)
         levels = np.array([matching.luma(matching.binned(image, self.binning)) for image in (left, right)])
@@ -233,11 +226,9 @@ class StereoVision:
             return [self.matcher.motion(node, other, pair) for other, pair in zip(others, matches, strict=True)]
 
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
-        """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured.
-
-        Without `settings.wide_search`, or if the texture repeats, only where the predicted poses are too uncertain for
-        matching, and rejected if it contradicts them. None if not tried, failed or rejected.
-        """
+        """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured."""
+        # without `wide_search`, or if the texture repeats, only where the poses are too uncertain for matching, and
+        # rejected if it contradicts them; None if not tried, failed or rejected
         if node.points is None or not len(node.points.xyz):
             return None
         ambiguous = max(self._repetition[key.row] for key in (node, other)) > MAX_REPETITION
@@ -288,11 +279,8 @@ class StereoVision:
 
 
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
-    """Returns half the side of the square of the mosaic that is used for registration [m].
-
-    This is 0.6 times the width of the footprint at the 90th percentile of the depths of the points: one mismatch with a
-    disparity of 0.5 px would make the square of the largest depth need 20 GB of memory.
-    """
+    """Returns half the side of the square of the mosaic that is used for registration [m]."""
+    # by the 90th percentile of the depths: one mismatch of 0.5 px would make that of the largest need 20 GB of memory
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 
 

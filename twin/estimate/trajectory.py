@@ -36,10 +36,8 @@ class PoseLog:
         return len(self.times_s)
 
     def append_after(self, first: int, time_s: float, f2f: Array, online: Array, motion: Array) -> None:
-        """Appends a frame whose motion (4, 4) was measured since the one before row `first`; closes the steps since.
-
-        The steps in between were predicted. The last one is taken to be like them.
-        """
+        """Appends a frame whose motion (4, 4) was measured since the one before row `first`; closes the steps since."""
+        # the steps in between were predicted; the last one is taken to be like them
         self.append(time_s, f2f, online, self.steps.array[-1].copy(), self.variances.array[-1].copy())
         motions = retract(np.tile(np.eye(4), (len(self) - first, 1, 1)), self.steps.array[first:])
         _close(motion, motions, np.maximum(self.variances.array[first:], _LEAST_VARIANCE))
@@ -72,11 +70,9 @@ def interpolate_between_keyframes(
 
 @kernel
 def _close(target, motions, variances):
-    """Corrects motions (n, 4, 4), in place, so that their product is the motion `target` (4, 4).
-
-    With the covariances C_k of the motions and the adjoint A_k from the axes after motion k to those at the end, the
-    corrections are C_k A_k' (sum of A C A')^-1 times the misclosure.
-    """
+    """Corrects motions (n, 4, 4), in place, so that their product is the motion `target` (4, 4)."""
+    # C_k A_k' (sum of A C A')^-1 times the misclosure, with covariances C_k and the adjoint A_k from the axes after
+    # motion k to those at the end
     n = len(motions)
     adjoints = np.empty((n, 6, 6))
     for _ in range(_MAX_ITERATIONS):

@@ -37,10 +37,8 @@ class Estimation(NamedTuple):
     def build_map(
         self, result: SurveyResult, grid: MapGrid | None, chosen: NDArray[np.bool_] | None = None
     ) -> ElevationMap | None:
-        """Returns the elevation map from the chosen keyframes; None without any, or if an interrupt ends the stage.
-
-        It is also None if an image could not be read, or the last one not written; `guard.cause` then says why.
-        """
+        """Returns the elevation map from the chosen keyframes; None without any, or if an interrupt ends the stage."""
+        # also None if an image could not be read, or the last one not written; `guard.cause` then says why
         report = partial(self.progress, "map")
         try:
             found = self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))

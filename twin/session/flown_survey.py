@@ -139,10 +139,9 @@ def make_orthomosaic(
 ) -> Maps | None:  # fmt: skip
     """Makes the orthomosaic of a survey, writes it if the run folder keeps maps, and compares it with the truth.
 
-    It is made from the images, the estimated poses and map, and, for the restoration of colours, from the lamps and the
-    water of the scenario; the true albedo is for the comparison only. The result has the elevation map with the colours
-    averaged to its cells; it is None without images or mapped cells. Raises OSError if a file cannot be read or
-    written.
+    The lamps and the water of the scenario serve the restoration of colours, the true albedo the comparison only.
+    Returns the elevation map with the colours averaged to its cells; None without images or mapped cells. Raises
+    OSError if a file cannot be read or written.
     """
     stopwatch, folder, restored = estimation.stopwatch, estimation.folder, mission.scenario.map.restore
     if not np.isfinite(elevation.height_m).any():

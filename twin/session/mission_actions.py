@@ -23,17 +23,14 @@ _STOPPED = 0.1  # below this rate, keyframes are added, because the plan has non
 
 
 class MissionActions:
-    """Chooses the pace along the path from the status of the estimates, frame by frame.
+    """Chooses the pace along the path from the status of the estimates, frame by frame; `log` gets each new action.
 
     The vehicle stops (`hold`) if no motion was measured for more than `BLIND_S` seconds, or `MAX_FAILED` keyframes in
     succession have no stereo: it would leave the last points that it can track. While blind, the speed that the
     estimators predict decays with the time constant with which the vehicle brakes (`BRAKING_S`), so prediction and
     reference agree. The vehicle slows down if many frames of the last second were lost; this is decided at measured
-    frames only, because a predicted motion has the speed of the last measured one.
-
-    A vehicle that cannot stop (it flies arcs) goes on along the path by dead reckoning.
-
-    `log` (`RunFolder.log`) gets each new action. `n_frames` does not count those of `add_measured_frames`.
+    frames only, because a predicted motion has the speed of the last measured one. A vehicle that cannot stop (it flies
+    arcs) goes on along the path by dead reckoning. `n_frames` does not count frames of `add_measured_frames`.
     """
 
     def __init__(self, mission: Mission, log: Callable[..., None] | None = None):
@@ -47,10 +44,7 @@ class MissionActions:
         self._lost: deque[bool] = deque([False] * n_window, n_window)
 
     def __call__(self, estimate: Estimate, is_keyframe: bool = False) -> Pace:
-        """Returns the pace from the current frame to the next, given the estimate of the current frame.
-
-        `is_keyframe`: whether the frame was to become a keyframe.
-        """
+        """Returns the pace to the next frame; `is_keyframe`: whether the frame of the estimate was to become one."""
         lost = estimate.status != "ok"
         if is_keyframe:
             self._n_failed = self._n_failed + 1 if estimate.status == NO_STEREO else 0

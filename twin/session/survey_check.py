@@ -25,10 +25,8 @@ def survey_findings(
 
 
 def with_altimeter_scale(mission: Mission, result: SurveyResult, elevation: ElevationMap | None) -> SurveyResult:
-    """Returns a result whose scale along the optical axis is that by the altimeter, if it has been read.
-
-    It is the mean ratio of the distances to the map along the beam of the altimeter to its readings.
-    """
+    """Returns a result whose scale along the optical axis is that by the altimeter, if it has been read."""
+    # the mean ratio of the distances to the map along the beam of the altimeter to its readings
     quality, beam_deg = result.quality, mission.scenario.navigation.altimeter_beam_deg
     if elevation is None or not np.isfinite(elevation.height_m).any():
         return result

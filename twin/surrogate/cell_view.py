@@ -46,10 +46,8 @@ class Cameras(NamedTuple):
 
 @kernel
 def window_in_reach(cells, cameras, lowest_m, pose):
-    """Returns first row, end row, first column and end column of the cells that a left camera at a pose may see.
-
-    They are those in the bounding box of the lowest floor in its image; all if the image shows the horizon.
-    """
+    """Returns first row, end row, first column and end column of the cells that a left camera at a pose may see."""
+    # those in the bounding box of the lowest floor in its image; all if the image shows the horizon
     west, east, south, north = pose[0, 3], pose[0, 3], pose[1, 3], pose[1, 3]
     for u in (-0.5, cameras.width_px - 0.5):
         for v in (-0.5, cameras.height_px - 0.5):
@@ -74,11 +72,9 @@ def window_in_reach(cells, cameras, lowest_m, pose):
 
 @kernel
 def visible_cells(cells, cameras, window, true, estimated):
-    """Finds the cells of a window whose floor both cameras of a keyframe with a true and an estimated pose (4, 4) see.
-
-    Returns the numbers of the cells (n,), depth [m] (n,) of the floor point that is mapped to each, its distance [px]
-    (n,) from the nearest border of the two images, and the information (n,) at its position in the left image.
-    """
+    """Returns the cells (n,) of a window whose floor both cameras of a keyframe, true and estimated (4, 4), see."""
+    # with the depth [m] (n,) of the floor point that is mapped to each, its distance [px] (n,) from the nearest border
+    # of the two images, and the information (n,) at its position in the left image
     first_row, end_row, first_col, end_col = window
     most = max(end_row - first_row, 0) * max(end_col - first_col, 0)
     found, values, n = np.empty(most, np.int64), np.empty((3, most)), 0
@@ -116,10 +112,7 @@ def _right_camera(cameras, true):
 
 @kernel(allocates=False)
 def _seen(cells, cameras, cell, point, camera_from_world, left, right):
-    """Returns depth, column and row of a cell's floor point in the left image, and its distance from the next border.
-
-    The distance is negative if the point is outside of an image or hidden.
-    """
+    """Returns depth, column, row of a cell's floor point on the left, and its distance from a border, < 0 if unseen."""
     focal_px, baseline_m = cameras.focal_px, cameras.baseline_m
     x, y, d = _normalised(camera_from_world, baseline_m, point)
     if not d > 0:  # also NaN
@@ -152,10 +145,8 @@ def mapped_heights(cells, cameras, index, true, estimated):
 
 @kernel
 def pose_variances(cells, index, position_m, cov):
-    """Returns the variances (n,) of the heights of cells due to the error of a pose; see `surface.pose_variance`.
-
-    `cov` (6, 6) is that of the pose of a camera at `position_m` (3,) [rotation, translation], in world axes.
-    """
+    """Returns the variances (n,) of the heights of cells due to the error of a pose; see `surface.pose_variance`."""
+    # `cov` (6, 6) is that of a camera at `position_m` (3,) [rotation, translation], in world axes
     variances, jacobian = np.empty(len(index)), np.empty(6)
     for k in range(len(index)):
         x, y, z = _centre(cells, index[k])
@@ -175,13 +166,10 @@ def pose_variances(cells, index, position_m, cov):
 def extend_runs(runs, index, border_px, information, following, squared_step):
     """Adds a keyframe to the runs of consecutive keyframes that observe its cells `index` (n,), ascending.
 
-    Returns the positions (m,) in `index` of the cells that the next keyframe, with the cells `following`, does not
-    see, and the runs (4, m) of these, which end.
-
-    Args:
-        runs: (4, rows * cols) number of keyframes, sum of the squared distances between neighbours, largest distance
-            from the border of the images and sum of `information`; 0 for cells whose run has ended.
-        squared_step: squared distance to the next keyframe.
+    Returns the positions (m,) in `index` of the cells that the next keyframe, with the cells `following` at a squared
+    distance `squared_step`, does not see, and the runs (4, m) of these, which end. `runs` (4, rows * cols) are number
+    of keyframes, sum of the squared distances between neighbours, largest distance from the border of the images and
+    sum of `information`; 0 for cells whose run has ended.
     """
     ended, n, k = np.empty(len(index), np.int64), 0, 0
     for at in range(len(index)):
@@ -206,10 +194,8 @@ def extend_runs(runs, index, border_px, information, following, squared_step):
 
 @kernel(allocates=False)
 def _source(cells, cameras, cell, camera_from_world, estimated):
-    """Returns the true floor point that is mapped to a cell: its centre minus the mapping error.
-
-    With calibration errors or an approximated port, the estimated pose determines it.
-    """
+    """Returns the true floor point that is mapped to a cell: its centre minus the mapping error."""
+    # with calibration errors or an approximated port, the estimated pose determines it
     x, y, z = _centre(cells, cell)
     if not cameras.table.values.size and cameras.table.yaw_rad == 0:
         return x, y, z

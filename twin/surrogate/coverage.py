@@ -49,11 +49,9 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
 
 
 def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[tuple[str, str]]:
-    """Returns, as texts, each quantity outside the allowed range with its values in a survey, and the allowed range.
-
-    The allowed range is the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names; an end
-    that is not named is unlimited. Quantities without a fitted range are not checked.
-    """
+    """Returns, as texts, each quantity outside the allowed range with its values in a survey, and the allowed range."""
+    # the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names, unlimited at others and
+    # without a fit
     found = []
     for name in [name for name in fitted if name in conditions]:
         (label, unit, factor, limits), (low, high) = QUANTITIES[name], conditions[name]

@@ -86,12 +86,8 @@ class ErrorModel(NamedTuple):
     map_half_px: float  #: bound at which half of the smooth map cells have a depth [px]
 
     def match_sigma_px(self, bound_px: float, stereo_parallax_px: float) -> float:
-        """Returns the standard deviation of a patch's position in one image [px].
-
-        Args:
-            bound_px: Cramér-Rao bound [px].
-            stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
-        """
+        """Returns the standard deviation of a patch's position in one image [px], by the Cramér-Rao bound [px]."""
+        # `stereo_parallax_px`: RMS parallax of the relief in a patch between the two cameras [px]
         relief_px = self.stereo_relief_gain * stereo_parallax_px
         return math.sqrt(self.match_floor_px**2 + (self.efficiency * bound_px) ** 2 + relief_px**2)
 

@@ -27,10 +27,8 @@ class FloorRelief(NamedTuple):
 
 
 def floor_relief(height_m: Map, cell_m: float, rig: StereoRig, depth_m: float) -> FloorRelief:
-    """Returns the relief of a floor of heights (rows, cols); in images, NaN is as low as the lowest height.
-
-    `rig` is the calibration of the images that are matched, `depth_m` a typical depth along the optical axis.
-    """
+    """Returns the relief of a floor of heights (rows, cols); in images, NaN is as low as the lowest height."""
+    # `rig`: calibration of the images that are matched; `depth_m`: a typical depth along the optical axis
     slope = np.stack(map_slopes(np.asarray(height_m, np.float64), cell_m), axis=-1).astype(np.float32)
     filled = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
     window_cells = WINDOW_PX * depth_m / rig.focal_px / cell_m
@@ -66,16 +64,12 @@ def step_slope(height_m: Array, cell_m: float) -> Map:
 def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
     """Returns the strength of the edges (rows, cols) [px^(1/2)], which determines the errors near walls.
 
-    It is the square root of r s, and 0 where the matching window of the cell shows no wall. The slope s of the cell, at
-    least `_LEAST_SLOPE`, counts because a lateral displacement of the matched edge causes a height error on the face of
-    the wall, and hardly any on the level floor next to the wall. r is the geometric mean of the roughness of the cell
-    and of the largest roughness of the windows that contain the cell: the error is large if the window of the cell
-    shows two surfaces, or if the cell is matched as its neighbours are. The square root is taken because dense matching
-    resolves large structures better.
-
-    Args:
-        roughness_px: (rows, cols) `roughness` [px of disparity].
-        slope: (rows, cols) `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
+    It is the square root of r s, and 0 where the matching window of the cell shows no wall, a cell steeper than
+    `WALL_SLOPE`. The `slope` s of the cell (`step_slope`), at least `_LEAST_SLOPE`, counts because a lateral
+    displacement of the matched edge causes a height error on the face of the wall, and hardly any on the level floor
+    next to the wall. r is the geometric mean of `roughness_px` [px of disparity] of the cell and the largest of the
+    windows that contain it: the error is large if the window of the cell shows two surfaces, or if the cell is matched
+    as its neighbours are. The square root is taken because dense matching resolves large structures better.
     """
     side = _odd(window_cells)
     near_wall = maximum_filter(slope, side) > WALL_SLOPE

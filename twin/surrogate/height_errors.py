@@ -87,14 +87,12 @@ class HeightSigmas(NamedTuple):
 
 
 def height_sigmas(model: ErrorModel, cells: CellConditions) -> HeightSigmas:
-    """Returns the standard deviations of the height errors.
-
-    With n keyframes at distances B, the variance is divided by 1 + g (n - 1), with g = depth_gain B^2 / (B^2 +
-    depth_half_step^2) + s, where s is the fraction of the variance that image noise causes: noise is independent
-    between keyframes at any distance, other errors only if the distance changes the images. At the border of the image,
-    half of the texture window is outside, and the standard deviation is twice as large. Small roughness r is resolved:
-    its error is a q^2 / sqrt(1 + q^4) with q = r / a and the limit a.
-    """
+    """Returns the standard deviations of the height errors."""
+    # with n keyframes at distances B, the variance is divided by 1 + g (n - 1), with g = depth_gain B^2 / (B^2 +
+    # depth_half_step^2) + s, s the fraction of the variance that image noise causes: noise is independent between
+    # keyframes at any distance, other errors only if the distance changes the images. At the border half of the texture
+    # window is outside, and the standard deviation is twice as large. Small roughness r is resolved: its error is a q^2
+    # / sqrt(1 + q^4) with q = r / a and the limit a.
     noise_share, lamps = model.noise_share(cells.window_px), model.lamp_factor(cells.lamp_share)
     squared_step = np.square(cells.step_baselines)
     gain = model.depth_gain * squared_step / (squared_step + model.depth_half_step**2) + noise_share

@@ -60,17 +60,11 @@ class MapNoise(NamedTuple):
 
 
 class MapModel:
-    """Samples the height patch of each keyframe: true heights of the floor plus errors.
+    """Samples the height patch of each keyframe: true heights (rows, cols) of the floor plus errors.
 
-    Args:
-        height_m: (rows, cols) true height at the cell centres.
-        rig: believed calibration, at the scale of the matched images.
-        floor: the true floor, for ray casting.
-
-    Attributes:
-        seen: (rows, cols) mask of the cells that at least one keyframe observed; updated by `mark_seen`.
-        conditions: conditions of the latest height of each cell, (rows * cols,) each.
-        n_heights: (rows * cols,) number of heights that were fused into the cell.
+    `rig` is the believed calibration, at the scale of the matched images; rays are cast to the true `floor`. `seen`
+    (rows, cols) masks the cells that at least one keyframe observed; updated by `mark_seen`. Of each cell, (rows *
+    cols,), `conditions` are those of the latest height, and `n_heights` the number of fused heights.
     """
 
     def __init__(
@@ -122,10 +116,8 @@ class MapModel:
         cell_view.mark_visible(self._cells, self._cameras, window, world_from_camera, self.seen.reshape(-1))
 
     def observe(self, true: Array, estimated: Array) -> ObservedCells:
-        """Returns the cells that a keyframe with a true and an estimated pose (4, 4) observes.
-
-        With calibration errors or an approximated port, the estimated pose determines which point is mapped to a cell.
-        """
+        """Returns the cells that a keyframe with a true and an estimated pose (4, 4) observes."""
+        # with calibration errors or an approximated port, the estimated pose determines which point is mapped to a cell
         window = cell_view.window_in_reach(self._cells, self._cameras, self._lowest_m, true)
         found = cell_view.visible_cells(self._cells, self._cameras, window, true, estimated)
         return ObservedCells(*found, true, estimated)
@@ -137,14 +129,9 @@ class MapModel:
         """Samples the heights of the cells that a keyframe sees and the next one does not; None if it sees none.
 
         The keyframes must be passed in the order of the path: the consecutive keyframes that observed a cell determine
-        the standard deviation of its height and whether it has one.
-
-        Args:
-            following: cells that the next keyframe observes; None for the last one.
-            cov: (6, 6) covariance of the estimated pose, in camera axes.
-
-        Raises:
-            FloatingPointError: a height or a variance is not finite.
+        the standard deviation of its height and whether it has one. `following` are the cells of the next one, None:
+        there is none; `cov` (6, 6) is that of the estimated pose, in camera axes. Raises FloatingPointError if a height
+        or a variance is not finite.
         """
         if not len(observed.cells):
             return None
@@ -199,10 +186,8 @@ class MapModel:
 
 
 def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
-    """Returns standard normal numbers (rows, cols) that are correlated over a square window, as matching errors are.
-
-    Their standard deviation exceeds 1 if the array has fewer rows or columns than the window.
-    """
+    """Returns standard normal numbers (rows, cols) that are correlated over a square window, as matching errors are."""
+    # their standard deviation exceeds 1 if the array has fewer rows or columns than the window
     noise = rng.standard_normal(shape, np.float32)
     return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
 

@@ -151,16 +151,11 @@ def _mean_colour(albedo: Image) -> Image:
 class Matchability:
     """Cramér-Rao bound of image matching and unevenness of the true floor, tabulated over the range of floor depths.
 
-    Attributes:
-        depths_m: (m,) ascending depths of the floor along the optical axis [m].
-        binning: side of the squares of pixels that the estimators average to one pixel [px].
-        bounds_px: (m,) Cramér-Rao bound c at these depths [px of the binned images]; infinite where marine snow
-            prevents all matches.
-        dependence: dependence of the bound on the position in the image, at the medium depth.
-        texture: distribution of the bound over the windows of dense matching, at the medium depth.
-        unevenness_px: (m,) the result of `unevenness_px` at these depths.
-        lamp_share: fraction of the light reflected by the floor that comes from the lamps.
-        clear_share: (m,) fraction of the matches that remain in the presence of marine snow, at these depths.
+    At `depths_m` (m,) of the floor along the optical axis, ascending, `bounds_px` (m,) is the bound in images binned by
+    `binning`, infinite where marine snow prevents all matches; `unevenness_px` (m,) that of the function of this name;
+    `clear_share` (m,) the fraction of matches that marine snow leaves. At the medium depth, `dependence` is that of the
+    bound on the position, `texture` its distribution over the windows of dense matching. `lamp_share` is the fraction
+    of the reflected light that comes from the lamps.
     """
 
     @np.errstate(invalid="raise")
@@ -253,13 +248,10 @@ def lamp_share(images: FloorImages, floor_lx: Radiance, depth_m: float) -> float
 
 
 def position_dependence(contrast: Radiance, noise: NDArray[np.float32]) -> PositionDependence:
-    """Returns the dependence of matching on the position; `NO_DEPENDENCE` if a block has no light or no noise.
-
-    Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The gradients of
-    an even texture are proportional to `FloorImages.contrast` (H, W, 3) of an even floor. The squares of
-    gradients and noise, `MatchedImages.noise`, are averaged over each block; the logarithm of the noise is smoothed by
-    a polynomial in the position.
-    """
+    """Returns the dependence of matching on the position; `NO_DEPENDENCE` if a block has no light or no noise."""
+    # light, veil and blur vary over the image, and with them gradients, as `FloorImages.contrast` (H, W, 3) of an even
+    # floor, and noise, `MatchedImages.noise`; their squares are averaged over each block, the logarithm of the noise is
+    # smoothed by a polynomial
     gradients, variance = (_block_means(matching.gray(image) ** 2) for image in (contrast, noise))
     if not gradients.min() > 1e-12 * gradients.max() or not variance.min() > 0:
         return NO_DEPENDENCE
@@ -309,14 +301,11 @@ def unevenness_px(
 ) -> Array:
     """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], an RMS over the planned area.
 
-    The unevenness of a patch is the RMS parallax relative to its best-fit plane, in pixels per unit of
-    baseline / depth: f rms(z) / depth, with z the height above that plane [m] and f the focal length [px]. Each patch
-    contributes at most `_LARGEST_UNEVENNESS` times the median over the patches, because the weights of the estimators
-    limit the influence of matches with large residuals.
-
-    Args:
-        locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
-            centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
+    The unevenness of a patch is the RMS parallax relative to its best-fit plane, in pixels per unit of baseline /
+    depth: f rms(z) / depth, with z the height above that plane [m] and f the focal length [px]. Each patch contributes
+    at most `_LARGEST_UNEVENNESS` times the median over the patches, because the weights of the estimators limit the
+    influence of matches with large residuals. `locate` maps fractions (..., 2) of the area along and across the legs,
+    -0.5 to 0.5 from its centre, to world (x, y) [m]; None: centred at the origin, legs along x.
     """
     focal_px, patch_px = scenario.believed_rig().binned(binning).focal_px, scenario.estimator_settings().patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)

@@ -79,11 +79,9 @@ class MeasuredView(NamedTuple):
         return true
 
     def motion_gain(self, points: Array, baseline_m: float) -> Array:
-        """Returns the (6, 6) matrix that maps the twist of a small true motion to the twist estimated from images.
-
-        The motion of the left camera is estimated by least squares from the measured flow and depth of true points
-        (n, 3); see `sampling.unit_motion_cov`. The matrix is empty if all are measured at their true positions.
-        """
+        """Returns the (6, 6) matrix that maps the twist of a small true motion to the twist estimated from images."""
+        # least squares from the measured flow and depth of true points (n, 3); see `sampling.unit_motion_cov`; empty if
+        # all are measured at their true positions
         if self.is_ideal:
             return np.zeros((0, 0))
         measured = self.measure(points)
@@ -244,14 +242,9 @@ class MeasuredRows:
     def observe(
         self, observation: StereoObservation, points: Array, sigma_px: float
     ) -> tuple[StereoObservation, float]:
-        """Adds the row differences of a stereo pair; returns the observation with their statistics, and a noise ratio.
-
-        The noise ratio is that of `stereo.row_noise_ratio`, but for any number of points.
-
-        Args:
-            points: (n, 3) true matched points, which represent `observation.n_points` points.
-            sigma_px: standard deviation of a match in one image [px].
-        """
+        """Adds the row differences of a stereo pair; returns the observation with statistics, and a noise ratio."""
+        # the ratio of `stereo.row_noise_ratio`, but for any number of points; `points` (n, 3) are true ones that
+        # represent `observation.n_points` matches, `sigma_px` is the standard deviation of a match in one image [px]
         rows_px, row_sigma_px = self._view.row_difference(points) * self._rig.focal_px, np.sqrt(2) * sigma_px
         of_raster = row_sigma_px * np.sqrt(len(points) / observation.n_points)
         self._add(points, rows_px + of_raster * self._rng.standard_normal(len(points)), of_raster)

@@ -55,27 +55,23 @@ def sample_link(
 ):  # fmt: skip
     """Samples the motion between two keyframes: estimates it from points with sampled noise, as from matched points.
 
-    Standard deviations and covariances are in normalised coordinates.
+    Standard deviations and covariances are in normalised coordinates. The true `points` (n, 3) of the later keyframe
+    are normalised (x, y, disparity), the true poses (4, 4). `camera` is focal length, principal point x and y, image
+    width and height, margin along the border [px]; baseline [m]; table of the measured positions of true points
+    (`measured_view.ViewTable`).
 
-    Args:
-        points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
-        later_noise: (n, 3) standard normal samples of the later stereo pair's errors at these points.
-        earlier_noise: (rows, cols, 3) those of the earlier stereo pair's biases, on a raster over its image.
-        relief_noise: (f, f, 2) those of the errors due to relief; they repeat every f floor cells.
-        normals: (n + 1, 3) those of this link alone: n for its points, the last one for their common bias.
-        earlier_pose, later_pose: (4, 4) true poses.
-        camera: focal length, principal point x and y, image width and height, margin along the border [px]; baseline
-            [m]; table of the measured positions of true points (`measured_view.ViewTable`).
-        cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
-        error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
-        distance_growth: growth of the variance in the earlier pair with distance / depth.
-        common_sigma: standard deviation of the bias that all points of a link share.
-        noise_share: number of points divided by the number of matches that they represent: the variance of the mean of
-            independent matches that a point represents, divided by that of a single match.
+    Standard normal samples: `later_noise` (n, 3) of the later pair's errors at these points; `earlier_noise` (rows,
+    cols, 3) of the earlier pair's biases, on a raster over its image; `relief_noise` (f, f, 2) of the errors due to
+    relief, repeated every f floor cells; `normals` (n + 1, 3) of this link alone: its points, and the last one for the
+    bias of deviation `common_sigma` that they share.
 
-    Returns:
-        Number of points that both keyframes see; motion earlier_from_later (4, 4), its reported covariance (6, 6), and
-        the yaw of the right camera as `_yaw` gives it. The latter are valid only if at least `MIN_POINTS` are seen.
+    A point has in either pair the reported covariance `cov` (3, 3) and the Cholesky factor `error_root` (3, 3) of the
+    true one, whose variance in the earlier pair grows by `distance_growth` with distance / depth. `noise_share` is the
+    number of points divided by that of the matches they represent: the variance of the mean of independent matches that
+    a point represents, divided by that of a single match.
+
+    Returns the number of points that both keyframes see; motion earlier_from_later (4, 4), its reported covariance (6,
+    6), and the yaw of the right camera as `_yaw` gives it. The latter are valid only if at least `MIN_POINTS` are seen.
     """
     focal, cx, cy, width, height, margin, baseline, table = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_sigma
@@ -130,10 +126,8 @@ def sample_link(
 
 @kernel
 def _yaw(observations, weight, inverse, right, change_a, change_b):
-    """Returns the yaw of the right camera, its standard deviation and its effect (6,) on the motion, as one (8,).
-
-    See `two_view_motion.YawEffect`; the standard deviation is infinite if the yaw is not observable.
-    """
+    """Returns yaw of the right camera, standard deviation (inf: not observable) and effect (6,) on the motion, (8,)."""
+    # see `two_view_motion.YawEffect`
     coupling, information, score = np.zeros(6), 0.0, 0.0
     for k in range(len(weight)):
         derivative = change_a[k] - observations.jacobian_point[k] @ change_b[k]
@@ -168,11 +162,9 @@ def _floor_cell(pose, point, baseline, cell_m, n):
 
 @kernel
 def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> Array:
-    """Returns the covariance (6, 6) of a motion estimated from flow and known depth.
-
-    The motion is estimated by least squares, Negahdaripour & Madjidi (2003), eq. (2), from `n_effective` flow vectors
-    of unit standard deviation, distributed over image and depth as `points` (n, 3), normalised (x, y, disparity).
-    """
+    """Returns the covariance (6, 6) of a motion estimated from flow and known depth."""
+    # least squares, Negahdaripour & Madjidi (2003), eq. (2), from `n_effective` flow vectors of unit standard
+    # deviation, distributed over image and depth as `points` (n, 3), normalised (x, y, disparity)
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])
     normal, _ = observation_equations.normal_equations(jacobian, np.full(n, n_effective / n), np.zeros((n, 2)))
@@ -181,10 +173,8 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> Array
 
 @kernel
 def measured_motion(points, earlier_pose, later_pose, camera, cov):
-    """Returns the motion earlier_from_later (4, 4) that is estimated from points without noise; see `sample_link`.
-
-    It is the true motion if all points are measured at their true positions, or if too few of them are in both views.
-    """
+    """Returns the motion earlier_from_later (4, 4) that is estimated from points without noise; see `sample_link`."""
+    # the true one if all points are measured at their true positions, or if too few of them are in both views
     if not camera[-1].values.size and camera[-1].yaw_rad == 0:
         return geometry.inverse(earlier_pose) @ later_pose
     noise, cells, normals = np.zeros(points.shape), np.zeros((1, 1, 3)), np.zeros((len(points) + 1, 3))
@@ -196,12 +186,9 @@ def measured_motion(points, earlier_pose, later_pose, camera, cov):
 
 @kernel
 def mosaic_correction(estimated, measured_motions, fractions, predicted_pose):
-    """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors.
-
-    Each keyframe in the mosaic is displaced by the error of the pose at which it was added. The correction is the mean
-    over the keyframes in view, weighted by `MosaicView.fractions`, given the pose (n, 4, 4) of the frame relative to
-    each of them without matching errors.
-    """
+    """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors."""
+    # each keyframe is displaced by the error of the pose at which it was added: their mean over those in view by
+    # `MosaicView.fractions`, given poses (n, 4, 4) of the frame relative to each, without matching errors
     predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)
     for k in range(len(fractions)):
         in_mosaic = estimated[k] @ measured_motions[k]

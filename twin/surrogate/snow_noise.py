@@ -34,12 +34,10 @@ def snow_poses(pose: StampedPose) -> list[StampedPose]:
 
 
 def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patch_px: int) -> tuple[float, float]:
-    """Returns the effect of snow on matches between views with different particles.
-
-    The variance of the weighted mean of n matches, times n [px^2], with the image noise; infinite without a match. The
-    fraction of the patches that are matched. `clean` are noise-free images of the same floor without snow, one for each
-    view, and `noise` is the standard deviation of the image noise [grey levels].
-    """
+    """Returns the effect of snow on matches between views with different particles."""
+    # variance of the weighted mean of n matches, times n [px^2], with the image noise, infinite without a match;
+    # fraction of matched patches. `clean`: noise-free images of the same floor without snow, one for each view;
+    # `noise`: standard deviation of the image noise [grey levels]
     weights, errors, n_patches = [], [], 0
     for k in range(len(clean)):
         other = (k + 1) % len(clean)

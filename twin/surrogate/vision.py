@@ -96,17 +96,11 @@ class FrameErrors(NamedTuple):
 class SurrogateVision:
     """Implementation of `Vision` that samples measurements from an error model.
 
-    Args:
-        true_pose: returns the current true world_from_camera (4, 4) of the left camera.
-
-    Attributes:
-        rig: calibration that the estimators use, at the scale of the images that they match, which may be binned.
-        view: positions at which the estimators measure true points.
-        last_pose: (4, 4) true pose of the last frame; None before the first one.
-        last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 if there was none since tracking
-            was restarted.
-        frame_errors: error distribution of the current frame-to-frame motions; None if there are no points to track.
-        n_corners: `corner_count`.
+    `true_pose` returns the current true world_from_camera (4, 4) of the left camera. `rig` is the calibration that the
+    estimators use, at the scale of the images that they match, which may be binned; `view` has the positions at which
+    they measure true points. `last_pose` (4, 4) is the true one of the last frame, None before the first one;
+    `last_normals` (6,) are the normal samples of the last frame-to-frame motion, 0 after tracking was restarted;
+    `frame_errors` is the error distribution of the current ones, None without points to track.
 
     Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`; so does `build_map` if
     the error model gives a height that is not finite.
@@ -411,11 +405,9 @@ def corner_count(rig: StereoRig, settings: EstimatorSettings) -> float:
 
 
 def overlap_inflation(n_points: float, rig: StereoRig, patch_px: int) -> float:
-    """Returns the variance of a mean over n patches, relative to that of patches without common pixels.
-
-    It is the expected value of `matching.variance_inflation` for patches spread over the image at random, which share a
-    fraction patch_px^2 / (width height) of their pixels on average.
-    """
+    """Returns the variance of a mean over n patches, relative to that of patches without common pixels."""
+    # the expected value of `matching.variance_inflation` for patches spread at random, which share a fraction
+    # patch_px^2 / (width height) of their pixels on average
     return 1 + n_points * patch_px**2 / (rig.width_px * rig.height_px)
 
 

@@ -165,11 +165,9 @@ class ComparisonVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        """Returns the map from images, and adds its classes of cells.
-
-        Errors and reported variances are relative to a sampled map without errors of measurement along the same path,
-        so that those due to the poses cancel. Only cells to which one patch contributed are compared.
-        """
+        """Returns the map from images, and adds its classes of cells."""
+        # relative to a sampled map without errors of measurement along the same path, so that those due to the poses
+        # cancel; only cells to which one patch contributed are compared
         found, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         self.surrogate.model = exact_map_model(model)
         exact = self.surrogate.build_map(result, grid, step_cov, lambda _: None)
@@ -227,11 +225,8 @@ def exact_map_model(model: ErrorModel) -> ErrorModel:
 
 
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
-    """Returns two error models for links: "patches" without errors due to relief, "relief" with hardly any others.
-
-    Both are without growth under lamps. In "patches", the bias fraction is `BIAS_FRACTION`; in "relief", the relief
-    gain is `RELIEF_GAIN`.
-    """
+    """Returns two error models for links: "patches" without errors due to relief, "relief" with hardly any others."""
+    # both without growth under lamps; with the bias fraction `BIAS_FRACTION`, and the relief gain `RELIEF_GAIN`
     no_lamps = model._replace(lamp_growth=0.0)
     return {
         "patches": no_lamps._replace(match_bias_fraction=BIAS_FRACTION, relief_gain=0.0),

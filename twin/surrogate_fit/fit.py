@@ -106,12 +106,10 @@ def _of_frames(s: SurveyStatistics, model: ErrorModel) -> Iterator[Comparison]:
 
 
 def _of_links(s: SurveyStatistics, model: ErrorModel, compared: ErrorModel) -> Iterator[Comparison]:
-    """Yields the comparisons of links, in thirds sorted by the distance between their keyframes.
-
-    The error of a link is the sum of those of its patches, which scale with the deviation of a match, and of relief,
-    which grow with the distance. The bias of a keyframe, which ends one link and starts the next, makes consecutive
-    errors cancel partly, relief makes them equal: the scalar products of the errors of consecutive links separate them.
-    """
+    """Yields the comparisons of links, in thirds sorted by the distance between their keyframes."""
+    # errors of patches scale with the deviation of a match, those of relief grow with the distance; the bias of a
+    # keyframe makes errors of consecutive links cancel partly, relief makes them equal: their scalar products separate
+    # them
     bound_px, conditions = s.median("bound_px"), (s.median("bound_px"), s.median("stereo_parallax_px"))
     match = model.match_sigma_px(*conditions) / compared.match_sigma_px(*conditions)
     lamps = float(model.lamp_factor(s.median("lamp_share")))

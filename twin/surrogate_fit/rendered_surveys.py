@@ -39,10 +39,8 @@ _NEEDED = ("consecutive_product_images", "mosaic_error_px", "f2f_interval_px", "
 
 
 def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> FittedErrorModel:
-    """Returns the error model fitted to the complete ones of rendered surveys; raises TwinError if fewer than two are.
-
-    Lost surveys may remove the upper limit of the range of the Cramér-Rao bound.
-    """
+    """Returns the error model fitted to complete rendered surveys; raises TwinError if fewer than two are."""
+    # lost surveys may remove the upper limit of the range of the Cramér-Rao bound
     complete = [s for s in surveys if _is_complete(s)]
     if len(complete) < _MIN_SURVEYS:
         raise TwinError("fit-surrogate", f"{len(complete)} surveys are complete", f"at least {_MIN_SURVEYS}")
@@ -94,12 +92,8 @@ def all_statistics(
 
 
 def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Returns the statistics of a rendered survey's comparison with the surrogate.
-
-    They are those saved in the folder for the same scenario and error model, or else the survey is flown. A survey
-    whose Cramér-Rao bound exceeds `_MAX_BOUND_PX` is not flown, and has no statistics. Raises ScenarioError if the
-    survey cannot be flown.
-    """
+    """Returns the statistics of a rendered survey's comparison with the surrogate; flies it unless they are saved."""
+    # none where the Cramér-Rao bound exceeds `_MAX_BOUND_PX`; raises ScenarioError if the survey cannot be flown
     identity = {"scenario_hash": scenario.fingerprint(), "model": repr(compared)}
     with suppress(TwinError):
         saved = read_json(folder / _FILE)

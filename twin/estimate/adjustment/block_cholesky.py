@@ -44,11 +44,8 @@ class CholeskyFactor(NamedTuple):
         return x.reshape(-1, _D, len(normals))[s.permutation]
 
     def inverse_block(self, node: int) -> Array:
-        """Returns the diagonal block (6, 6) of the inverse matrix that belongs to a node.
-
-        The block is y'y with y = L^-1 e, where e consists of the node's six columns of the identity matrix. Only the
-        node's panel and its ancestors in the elimination tree contribute.
-        """
+        """Returns the diagonal block (6, 6) of the inverse matrix that belongs to a node."""
+        # y'y with y = L^-1 e, e the node's columns of the identity; only its panel and the ancestors of that contribute
         s = self.symbolic
         right, block = np.zeros((len(s.permutation), _D, _D)), np.zeros((_D, _D))
         right[s.permutation[node]] = np.eye(_D)
@@ -248,10 +245,7 @@ def _solve_in_place(s, panels, x):
 
 @kernel
 def _solve_transposed_in_place(s, panels, x):
-    """Solves the linear system of the transposed factor, L' y = x; x, (6 n,) or (6 n, m), becomes y.
-
-    x is in elimination order.
-    """
+    """Solves L' y = x for the transposed factor; x, (6 n,) or (6 n, m) in elimination order, becomes y."""
     for p in range(len(s.panel_start) - 2, -1, -1):
         own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
         panel = _panel_matrix(s, panels, p)

@@ -80,10 +80,7 @@ def _minimum_degree(n: int, i: Indices, j: Indices) -> Indices:
 
 
 def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], Indices]]:
-    """Returns, for each supernode in elimination order, its nodes and the nodes of the nonzero rows below it.
-
-    The nodes early < late (m,) of each off-diagonal block are numbered in elimination order.
-    """
+    """Returns by supernode its nodes and those of the rows below; nodes early < late (m,) are in elimination order."""
     order = np.argsort(early, kind="stable")
     start, below = _fill_in(n, np.searchsorted(early[order], np.arange(n + 1)), late[order])
     count = np.diff(start).tolist()

@@ -259,10 +259,8 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
 
 @kernel
 def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient):
-    """Adds m binary factors to the diagonal blocks (n, 6, 6) and gradients (n, 6); fills the blocks (i, j) (m, 6, 6).
-
-    The Jacobian with respect to the increment of pose i is J_i = -J_j Ad(j_from_i).
-    """
+    """Adds m binary factors to diagonal blocks (n, 6, 6) and gradients (n, 6); fills the blocks (i, j) (m, 6, 6)."""
+    # the Jacobian with respect to the increment of pose i is J_i = -J_j Ad(j_from_i)
     n = residuals.shape[1]
     half, matrix, slope, to_i = np.empty((6, n)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
     for m in range(len(first)):
@@ -309,10 +307,7 @@ def _add_border(first, second, by_j, weighted, i_from_j, border):
 def motion_factors(
     links: Sequence[Link], index_of: dict[int, int], huber: float | None = None, effect: Effect | None = None
 ) -> BinaryFactors:
-    """Returns binary factors of measured motions, with the loss of `BinaryFactors.huber`.
-
-    `effect` is that of the shared parameters on the measured motions; None: they have none.
-    """
+    """Returns factors of measured motions; `effect` is that of the shared parameters on them, None: they have none."""
     columns = Links.from_sequence(links)
     measured, information = (np.ascontiguousarray(column) for column in (columns.i_from_j, columns.information))
     i, j = (np.array([index_of[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))

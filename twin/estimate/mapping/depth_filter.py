@@ -14,8 +14,7 @@ from twin.kernels import kernel
 #: A measured depth z of variance R is accepted at a pixel where the filter has depth h of variance P if its innovation
 #: z - h satisfies (z - h)^2 < GATE (P + R). The value is the 99.9 % quantile of chi-square, one degree of freedom.
 GATE = 10.83
-#: Depth is not interpolated between neighbours whose disparities differ by more: they are on different surfaces [px].
-JUMP_PX = 1.2
+JUMP_PX = 1.2  #: neighbours whose disparities differ by more are on different surfaces [px]
 #: Standard deviation of depth from motion due to errors other than image noise and pose [px of stereo disparity].
 MOTION_MIN_SIGMA_PX = 0.03
 
@@ -34,10 +33,7 @@ def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
 
 
 def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
-    """Returns the fusion of two depth maps of the same image, by a scalar Kalman update of each pixel.
-
-    A pixel whose innovation does not pass the `GATE` keeps its prior depth. A depth known in only one map is taken.
-    """
+    """Returns two depth maps of an image, fused by scalar Kalman updates; a pixel that fails `GATE` keeps its prior."""
     fused = DepthMap(prior.depth_m.copy(), prior.variance_m2.copy())
     _fuse(*fused, *measured, GATE)
     return fused
@@ -46,14 +42,13 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
 def propagate(
     old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig
 ) -> tuple[DepthMap, Mask]:
-    """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth (as `fuse` does).
+    """Returns the old depth map propagated to the new keyframe and fused with its stereo depth (as `fuse` does).
 
     Each new pixel is linearised at its stereo depth (or, without one, at the smallest depth of the old points that
     project there) and projected into the old image, whose map is interpolated except across discontinuities. The
     difference of depth is converted, with the surface normal, to one along the ray of the new pixel. `step_cov` (6, 6)
-    is that of the relative pose [rotation, translation] (rad, m), in the new camera axes.
-
-    Returns the new depth map, and a mask (H, W) of the pixels whose depth has information from the old map.
+    is that of the relative pose [rotation, translation] (rad, m), in the new camera axes. Also returns a mask (H, W) of
+    the pixels with information from the old map.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
     guess = new.depth_m.copy()
@@ -153,10 +148,8 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 
 @kernel(inline="always")
 def _normal(depth, u, v, camera, focal_baseline, jump):
-    """Returns the surface normal (x, y, z) at a pixel, scaled so that normal . ray = 1 / depth, for a ray with z = 1.
-
-    The gradient of inverse depth is zero across discontinuities, next to unknown pixels and at the image border.
-    """
+    """Returns the surface normal (x, y, z) at a pixel, scaled so that normal . ray = 1 / depth for a ray with z = 1."""
+    # the gradient of inverse depth is zero across discontinuities, next to unknown pixels and at the image border
     (focal, cx, cy), (height, width) = camera, depth.shape
     slope_u, slope_v = 0.0, 0.0
     if 0 < u < width - 1:

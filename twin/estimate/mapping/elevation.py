@@ -15,17 +15,11 @@ from twin.kernels import kernel
 
 #: The higher of two hypotheses is chosen if the depth variance of the lower one is more than this many times larger.
 _VARIANCE_RATIO = 10.0
-#: Measured probability that the chosen hypothesis of a cell with two hypotheses is wrong.
-_WRONG_CHOICE = 0.16
-#: For a cell at a right-angled corner of a step, number of neighbours on its own side (at a straight step: 5).
-_NEIGHBOURS_AT_CORNER = 3
+_WRONG_CHOICE = 0.16  # measured probability that the chosen hypothesis of a cell with two hypotheses is wrong
+_NEIGHBOURS_AT_CORNER = 3  # of a cell at a right-angled corner of a step, on its own side (at a straight step: 5)
 MIN_CELLS = 12
-#: Row and column of the eight neighbours of a cell in a window of 3 x 3 cells.
-_NEIGHBOURS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2))
-
-
-#: A cell is supported by this many neighbours of agreeing height (`_contradicted`).
-_SUPPORT = 3
+_NEIGHBOURS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2))  # rows and columns in 3 x 3 cells
+_SUPPORT = 3  # a cell is supported by this many neighbours of agreeing height (`_contradicted`)
 
 
 class ElevationMapper:
@@ -56,11 +50,9 @@ class ElevationMapper:
         self._lateral_m: list[float] = [0.0, 0.0]  # sum and number of the lateral errors of the patches
 
     def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
-        """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
-
-        A cell was propagated if the successor, the patch of the next keyframe, has a height for it, at a pixel whose
-        depth contains information from this keyframe (mask `inherited` (H, W)), and the two heights agree.
-        """
+        """Fuses those cells of a patch into the map that were not propagated to the next keyframe."""
+        # propagated: the successor (patch of the next keyframe) has an agreeing height at a pixel whose depth contains
+        # information from this keyframe (`inherited` (H, W))
         self._lateral_m = [self._lateral_m[0] + patch.lateral_m, self._lateral_m[1] + 1]
         height = patch.height_m
         if successor is not None and inherited is not None:
@@ -123,10 +115,8 @@ def _taken(layers: NDArray[Any], which: NDArray[np.int64]) -> Any:
 
 
 def _isolated(height: Map, other: Map) -> Mask:
-    """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis, not the chosen one.
-
-    Of at least five known neighbours, fewer than `_NEIGHBOURS_AT_CORNER` are nearer to `height`: usually a mismatch.
-    """
+    """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis, not the chosen one."""
+    # of at least five known neighbours, few are nearer to `height`: usually a mismatch
     around = np.lib.stride_tricks.sliding_window_view(np.pad(height, 1, constant_values=np.nan), (3, 3))
     known, agreeing = np.zeros(height.shape, np.int8), np.zeros(height.shape, np.int8)
     for i, j in _NEIGHBOURS:
@@ -144,13 +134,10 @@ def _small_groups(known: Mask) -> Mask:
 
 
 def _contradicted(height: Map, variance: Map, edge_fraction: float) -> Mask:
-    """Returns a mask (rows, cols) of the known cells, alone or in twos and threes, that contradict their neighbours.
-
-    Heights h and k agree if (h - k)^2 < GATE (P + Q + E), with their variances P and Q, and E the square of
-    `edge_fraction` times the range of the neighbours' heights without the two highest and lowest (only for cells that
-    are not supported without it). A cell is supported if `_SUPPORT` neighbours agree, or one that is supported so; a
-    cell that is not, and contradicts a neighbour, is a mismatch.
-    """
+    """Returns a mask (rows, cols) of the known cells, alone or in twos and threes, that contradict their neighbours."""
+    # heights h and k agree if (h - k)^2 < GATE (P + Q + E), with their variances P and Q, and E the square of
+    # `edge_fraction` times the range of the neighbours without the two highest and lowest (only for cells that are not
+    # supported without it); supported are cells with `_SUPPORT` agreeing neighbours, or one that is supported so
     rows, cols = height.shape
     near, near_variance = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, variance))
     n_agreeing = np.zeros(height.shape, np.int8)

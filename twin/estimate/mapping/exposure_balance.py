@@ -21,8 +21,7 @@ from scipy.sparse.linalg import spsolve
 from twin.core import geometry
 from twin.core.records import Array, ElevationMap, Exposure, Image, StereoRig
 
-#: Weight of the prior of an exposure or a coefficient of the pattern, relative to the colour of a patch in one image.
-_PRIOR = 1e-3
+_PRIOR = 1e-3  # weight of an exposure or a coefficient of the pattern, relative to a patch in one image
 _PATCH_PX = 16  # spacing of the patches; the standard deviation of the Gaussian average of their colours is a quarter
 _BATCH = 2**14  # number of patches that `cv2.remap` reads at a time; it refuses arrays of more than 32766 rows
 _MIN_LEVEL = 4.0  # darkest mean colour that is used [grey levels]

@@ -27,11 +27,8 @@ class MapTile(NamedTuple):
 
 
 def footprint_grid(result: SurveyResult, rig: StereoRig, most_cells: float = _MOST_CELLS) -> MapGrid:
-    """Returns the grid that covers all keyframe images, each projected to the median depth of its matched points.
-
-    A cell is as large as three pixels at the median depth of all keyframes, or larger to limit the grid to about
-    `most_cells` cells. The final trajectory of the result, with at least one keyframe, is in the axes of the map.
-    """
+    """Returns the grid, in the axes of the final trajectory, that covers all keyframe images at their median depths."""
+    # a cell is as large as three pixels at the median depth of all keyframes, or larger for about `most_cells` cells
     seen = _corners(result, rig).reshape(-1, 2)
     cell = _CELL_PX * float(np.median(result.keyframe_depth_m)) / rig.focal_px
     size_m = np.ptp(seen, axis=0) + 2 * cell
@@ -68,10 +65,8 @@ def footprint_tiles(
 
 
 def steps_between(step_cov: Array, keyframes: NDArray[np.int64]) -> Array:
-    """Returns the covariance (m, 6, 6) of each chosen keyframe (m,), m > 0, relative to the chosen one before.
-
-    It sums `step_cov` (n, 6, 6) without lever arms, as nothing is propagated between keyframes that are far apart.
-    """
+    """Returns the covariance (m, 6, 6) of each chosen keyframe (m,), m > 0, relative to the chosen one before."""
+    # without lever arms, as nothing is propagated between keyframes that are far apart
     first, until = step_cov[keyframes[:1]], step_cov[: keyframes[-1] + 1]
     if len(keyframes) == 1:
         return first

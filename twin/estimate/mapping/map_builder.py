@@ -1,4 +1,4 @@
-"""Construction of the map from the stereo pairs along the final trajectory: depth filter, heights and orthomosaic."""
+"""Construction of the map from the stereo pairs along the final trajectory: depth filter, heights, and their test."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -26,6 +26,8 @@ MAX_STEREO_SIGMA_PX = 0.5
 #: Largest relative standard deviation of a stereo depth that enters the map; that of its disparity is the same. At 20 %
 #: the interval of five standard deviations reaches to infinite depth.
 MAX_RELATIVE_SIGMA = 0.2
+MIN_COMMON = 200  # cells with heights from both sets that a comparison of two sets of keyframes needs
+_ONE_WAY = 0.2  # share of the keyframes in one of two directions below which a path has no legs there and back
 
 
 ImagePair = tuple[Image, Image]  # left and right image (H, W, 3)
@@ -59,10 +61,8 @@ def build_map(
     pattern: Map = _NO_PATTERN,
     calibration: CalibrationEstimate = EXACT,
 ) -> ElevationMap:
-    """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far.
-
-    Depths are corrected for the errors of `calibration`; what remains uncertain is part of the standard deviations.
-    """
+    """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far."""
+    # depths are corrected for the calibration; what remains uncertain of it is part of the standard deviations
     rig = replace(rig, baseline_m=rig.baseline_m * (1 + calibration.baseline_error))
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
     poses, old = path.world_from_camera, None
@@ -89,11 +89,8 @@ def build_map(
 def with_calibration_sigma(
     found: ElevationMap, poses: Array, rig: StereoRig, calibration: CalibrationEstimate
 ) -> ElevationMap:
-    """Returns the map with the uncertainty of the calibration in its standard deviations.
-
-    A yaw e changes a depth Z = b / d by -Z^2 e / b at the image centre, a baseline error e by Z e. These errors are the
-    same in all keyframes, so that they do not average out. Z is taken from the mean height of the cameras.
-    """
+    """Returns the map with the uncertainty of the calibration, common to all keyframes, in its standard deviations."""
+    # a yaw e changes a depth Z = b / d by -Z^2 e / b at the image centre, a baseline error e by Z e
     if not calibration.cov.any():
         return found
     depth_m = float(np.mean(poses[:, 2, 3])) - found.height_m.astype(np.float64)
@@ -132,3 +129,21 @@ def _advance(
     fused, inherited = depth_filter.propagate(old.depth, stereo_depth, geometry.inverse(old_from_new), step_cov, rig)
     motion = depth_filter.motion_depth(gray, old.gray, fused, old_from_new, step_cov, rig)
     return depth_filter.fuse(fused, motion), inherited
+
+
+def flown_back(positions_m: Array) -> Mask:
+    """Returns which keyframes (n,) at positions (n, 3) are on legs back, or every other one without such legs."""
+    # legs there and back show a point at different field angles, where errors of distortion and pose differ
+    step_m = np.gradient(positions_m, axis=0)
+    back = step_m @ np.linalg.svd(step_m, full_matrices=False)[2][0] < 0
+    return back if _ONE_WAY <= back.mean() <= 1 - _ONE_WAY else np.arange(len(back)) % 2 == 1
+
+
+def with_scatter(elevation: ElevationMap, one: ElevationMap, other: ElevationMap) -> ElevationMap:
+    """Returns a map with the RMS difference / standard deviation of heights from two sets of keyframes, on its grid."""
+    # it multiplies the standard deviations if above 1: the scale factor of Birge (Phys. Rev. 40, 207, 1932)
+    ratio = (one.height_m - other.height_m) / np.hypot(one.sigma_m, other.sigma_m)
+    if np.isfinite(ratio).sum() < MIN_COMMON:
+        return elevation
+    scatter = float(np.sqrt(np.nanmean(ratio.astype(np.float64) ** 2)))
+    return replace(elevation, sigma_m=elevation.sigma_m * np.float32(max(scatter, 1.0)), scatter=scatter)

@@ -13,10 +13,8 @@ from twin.core.threads import prefetched
 from twin.estimate.mapping.exposure_balance import estimated_factors, patch_colours, patch_points, reported_factors
 from twin.estimate.mapping.orthophoto import OrthoLayers, add_view, empty_layers, footprint
 
-#: Width of the margin around a tile: the floor in it is taken into account as it may hide pixels of the tile [px].
-_MARGIN_PX = 64
-#: Unmapped cells are filled up to this distance from mapped ones, so that small holes of the map have a colour [cells].
-_FILLED_CELLS = 3
+_MARGIN_PX = 64  # width of the margin around a tile, whose floor may hide pixels of the tile [px]
+_FILLED_CELLS = 3  # small holes of the map have a colour up to this distance from mapped cells [cells]
 
 
 class Views(NamedTuple):
@@ -70,10 +68,8 @@ def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid
 
 
 def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
-    """Returns the heights (rows, cols) [m] of a map at the pixels of a grid that divide its cells, by interpolation.
-
-    Small holes of the map have the height of the nearest mapped cell; other holes and pixels outside are NaN.
-    """
+    """Returns the heights (rows, cols) [m] of a map at the pixels of a grid that divide its cells, by interpolation."""
+    # small holes have the height of the nearest mapped cell; other holes and pixels outside are NaN
     grid, n = elevation.grid, round(elevation.grid.cell_m / part.cell_m)
     first = np.array([grid.north_m - part.north_m, part.west_m - grid.west_m]) / grid.cell_m
     row, col = np.floor(first + 1e-6).astype(int) - _FILLED_CELLS - 1

@@ -19,11 +19,9 @@ from twin.kernels import kernel
 #: 17 pixels of an image with a focal length of 277 px.
 SHARPNESS = 240.0
 _SATURATED = 60.0  # added to -log w where a pixel of the image is saturated; -log w of a view 27 deg from nadir
-#: A view for which exp(-K tan^2(n)) is less than exp(-this) times the best weight so far is not added.
-_NEGLIGIBLE = 7.0
+_NEGLIGIBLE = 7.0  # a view for which exp(-K tan^2(n)) is less than exp(-this) times the best weight is not added
 _RAMP_PX, _LEAST_RAMP = 12.0, 1e-3  # width of the ramp at the border of the image, and its value at the border
-#: A pixel is hidden if floor that projects to the same pixel of the image is nearer by more than this fraction.
-_HIDDEN_SHARE = 0.02
+_HIDDEN_SHARE = 0.02  # a pixel is hidden if floor at the same pixel of the image is nearer by more than this fraction
 
 
 class OrthoLayers(NamedTuple):
@@ -43,10 +41,8 @@ def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
 
 
 def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
-    """Returns the bounding box (west, south, east, north) [m] of all floor between two heights that an image can show.
-
-    Infinite if the camera is not above the lowest floor or a corner ray does not point downwards.
-    """
+    """Returns the bounds (west, south, east, north) [m] of all floor between two heights that an image can show."""
+    # infinite if the camera is not above the lowest floor or a corner ray does not point downwards
     u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
     corners = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     rays = np.column_stack([rig.normalised(corners), np.ones(4)]) @ world_from_camera[:3, :3].T
@@ -66,10 +62,7 @@ def add_view(
     rig: StereoRig,
     heights_m: tuple[float, float],
 ) -> None:
-    """Adds an image (H, W, 3), seen at a pose (4, 4) in map axes, to the layers, in place.
-
-    `saturated` (H, W) is 1 where the colour is not reliable, because this pixel or a neighbour is saturated, else 0.
-    """
+    """Adds an image (H, W, 3) at a pose (4, 4) in map axes; `saturated` (H, W) is 1 where a colour is not reliable."""
     grid = layers.grid
     bounds = _pixels_within(footprint(world_from_camera, rig, heights_m), grid)
     if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
@@ -121,11 +114,9 @@ def _blend(
     height, colour, weight, best, first, end, left, right, steps, origin, camera_at, camera, image, clipped,
     nearest,
 ):  # fmt: skip
-    """Adds the colours of an image to `colour`, `weight` and `best` (see `OrthoLayers`) in these rows and columns.
-
-    `steps` (3, 3) has as columns the displacements in camera axes per column, row and metre of height; `origin` (3,) is
-    pixel (0, 0) at height 0 in camera axes, `camera_at` (4,) the camera relative to it and the size of a pixel [m].
-    """
+    """Adds the colours of an image to `colour`, `weight` and `best` (see `OrthoLayers`) in these rows and columns."""
+    # columns of `steps` (3, 3): displacements in camera axes per column, row and metre of height; `origin` (3,): pixel
+    # (0, 0) at height 0 in these axes; `camera_at` (4,): the camera relative to it, and the size of a pixel [m]
     focal, cx, cy = camera
     rows, cols, _ = image.shape
     east, north, up, cell = camera_at

@@ -9,8 +9,7 @@ from twin.core.records import Map, MapGrid, StereoRig
 from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap, variance_along
 from twin.kernels import kernel
 
-#: Smallest cosine between normal and line of sight of a triangle; a grazing one may connect two separate surfaces.
-MIN_COSINE = 0.05
+MIN_COSINE = 0.05  #: between normal and line of sight; a grazing triangle may connect two separate surfaces
 #: Standard deviation of the lateral error of the surface [px of the image]; in metres, it is this value times depth /
 #: focal length. Fusion does not reduce it, because the matching window smooths relief and displaces edges in similar
 #: ways in all views. On a surface of slope s it causes a height error of s times the lateral error.

@@ -8,31 +8,25 @@ from twin.core.records import Map, MapGrid, Mask
 from twin.estimate.mapping.depth_filter import GATE
 from twin.kernels import kernel
 
-#: Connected groups of cells of agreeing heights with at most this many cells are islands; larger ones are the surface.
-LARGEST_ISLAND = 400
+LARGEST_ISLAND = 400  #: connected cells of agreeing heights that are an island; larger groups are the surface
 #: A line of sight is blocked where it passes this many standard deviations below the surface, in a cell whose eight
 #: neighbours are known and as high.
 _SIGMAS = 3.0
 
 
 def main_surface(height: Map, variance: Map) -> Mask:
-    """Returns a mask of the known cells in groups of more than `LARGEST_ISLAND` cells of agreeing heights.
-
-    Neighbouring cells, of heights h and k and variances P and Q, are connected if (h - k)^2 < GATE (P + Q).
-    """
+    """Returns a mask of the known cells in groups of more than `LARGEST_ISLAND` cells of agreeing heights."""
+    # neighbours of heights h and k and variances P and Q are connected if (h - k)^2 < GATE (P + Q)
     return _large_groups(height, variance, GATE, LARGEST_ISLAND)
 
 
 def hidden(height: Map, camera: NDArray[np.int32], cameras_m: Array, surface: tuple[Map, Map], grid: MapGrid) -> Mask:
-    """Returns a mask (rows, cols) of the heights that their camera cannot have seen.
+    """Returns a mask (rows, cols) of the heights [m], NaN where there is none, that their camera cannot have seen.
 
-    The line of sight from a height to its camera is followed in steps of one cell. It is blocked where it passes below
-    the lowest height of the surface in the 3 x 3 cells around it by more than three standard deviations.
-
-    Args:
-        height: (rows, cols) heights to check [m]; NaN where there is none.
-        camera: (rows, cols) row of `cameras_m` (n, 3) [m] for each height; a height with a negative one passes.
-        surface: heights of the surface (rows, cols) [m], NaN where there is none, and their variance [m2].
+    The line of sight from a height to its camera, the row of `cameras_m` (n, 3) [m] in `camera` (rows, cols), negative
+    if unknown, is followed in steps of one cell. It is blocked where it passes below the lowest height of the `surface`
+    in the 3 x 3 cells around it by more than three standard deviations; `surface` is heights (rows, cols) [m] and their
+    variance [m2].
     """
     low, variance = surface
     if not len(cameras_m):

@@ -95,11 +95,9 @@ def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNois
 
 
 def _vertical_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    """Returns the factors of the verticals measured by an IMU.
-
-    The residuals (m, 2) are the components of the predicted vertical perpendicular to the measured one, in the camera.
-    The accelerometer's error is common to all n readings, so each has n times the variance.
-    """
+    """Returns the factors of the verticals measured by an IMU."""
+    # residuals (m, 2): components of the predicted vertical perpendicular to the measured one, in the camera; the error
+    # of the accelerometer is common to all n readings, so each has n times the variance
     index, up = _readings(nodes, "up")
     measured = up.reshape(-1, 3) @ rig.body_from_camera[:3, :3]
     across = np.array([pose_filter.perpendicular_axes(axis) for axis in measured]).reshape(-1, 2, 3)
@@ -114,11 +112,9 @@ def _vertical_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNo
 
 
 def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFactors:
-    """Returns the factors of the displacements between nodes measured by the DVL: measured = (1 + s) d + noise.
-
-    d is the displacement of the body's origin, in the body axes at the earlier node; s is the scale error of the DVL,
-    the first of the shared parameters. A displacement whose earlier node is not in `nodes` is left out.
-    """
+    """Returns the factors of the DVL's displacements between nodes: measured = (1 + s) d + noise."""
+    # d: displacement of the body's origin in the body axes at the earlier node, which is in `nodes`; s: scale error of
+    # the DVL, the first of the shared parameters
     index_of = {node.number: k for k, node in enumerate(nodes)}
     with_dvl = [(k, node.dvl_displacement) for k, node in enumerate(nodes) if node.dvl_displacement is not None]
     pairs = [(index_of[d.since], k, d) for k, d in with_dvl if d.since in index_of]

@@ -101,10 +101,8 @@ class DvlIntegrator:
 
 @kernel
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
-    """Returns the displacement (3,) [m] of the body's origin for a motion of the camera, in the body axes before it.
-
-    Also its Jacobian (3, 6) with respect to an increment of the motion, in the axes of the later camera.
-    """
+    """Returns the displacement (3,) [m] of the body by a motion of the camera, in the body axes before it."""
+    # and its Jacobian (3, 6) with respect to an increment of the motion, in the axes of the later camera
     camera_from_body = geometry.inverse(body_from_camera)
     body_a_from_b = geometry.compose(body_from_camera, a_from_b)
     lever, by_motion = geometry.skew(camera_from_body[:3, 3]), np.zeros((3, 6))
@@ -118,12 +116,10 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
 @kernel
 def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
-    """Fuses the visual motion since the last reading with the DVL readings, and adds it to the integration.
-
-    The reading of this frame, `velocity` (3,) in body axes [m/s], is NaN if there is none. Returns a `MotionUpdate`,
-    `a_from_b` and `cov` unchanged if there is no reading, or if it contradicts the visual motion. The integration
-    becomes incomplete if it does, or if the last reading is too long ago.
-    """
+    """Fuses the visual motion since the last reading with the DVL readings, and adds it to the integration."""
+    # `velocity` (3,) of this frame in body axes [m/s], NaN without; motion and covariance are unchanged without one, or
+    # if it contradicts the visual motion. The integration becomes incomplete if it does, or if the last reading is too
+    # long ago.
     nothing = np.eye(4), np.zeros((6, 6))
     before, before_cov, motion, motion_cov, duration_s = nothing[0], nothing[1], a_from_b, cov, model.step_s
     if state.gap_s[0] > 0:
@@ -184,10 +180,8 @@ def _length(step):
 
 @kernel
 def _step_cov(state, scale_variance, white_m2, step):
-    """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error.
-
-    The scale error s accumulates: a displacement l after a path L adds s^2 ((L + l)^2 - L^2) along its direction.
-    """
+    """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error."""
+    # the scale error s accumulates: a displacement l after a path L adds s^2 ((L + l)^2 - L^2) along its direction
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
     for i in range(3):
@@ -198,10 +192,7 @@ def _step_cov(state, scale_variance, white_m2, step):
 
 @kernel
 def _accumulate(state, body_from_camera, step, step_cov, a_from_b, cov):
-    """Adds a motion, with displacement `step` (3,) in the body axes before it [m], to the integration.
-
-    `step_cov` (3, 3) is the covariance of its white noise in the axes at the node.
-    """
+    """Adds a motion with its displacement (3,) in the body axes before it [m], and its noise (3, 3) at the node."""
     node_from_body = state.node_from_body
     for i in range(3):
         state.displacement_m[i] += (
@@ -225,9 +216,7 @@ def _displacement_cov(state):
 
 @kernel
 def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera, gates):
-    """Returns a motion, its covariance and whether it was used, after a Kalman update with a body displacement.
-
-    The displacement (3,) [m] and its covariance (3, 3) are in the axes of the body before the motion.
-    """
+    """Returns a motion, its covariance and whether it was used, after a Kalman update with a body displacement."""
+    # (3,) [m], with its covariance (3, 3), in the axes of the body before the motion
     expected, by_motion = body_displacement(a_from_b, body_from_camera)
     return fuse_reading(a_from_b, cov, step - expected, by_motion, step_cov, gates, DVL)

@@ -11,8 +11,7 @@ from twin.kernels import kernel
 
 SENSORS = ("pressure", "ahrs", "dvl", "usbl", "beacons", "vertical")  # navigation sensors, in the order of their gates
 PRESSURE, AHRS, DVL, USBL, BEACONS, VERTICAL = range(6)
-#: Largest chi2 of a reading with 1, 2 and 3 components; one in 1e9 exceeds it.
-_READING_GATES = (37.3, 41.4, 44.8)
+_READING_GATES = (37.3, 41.4, 44.8)  # chi2 of a reading with 1, 2 and 3 components; one in 1e9 exceeds it
 #: Number of consecutive readings of each sensor that contradict the pose before they are disputed: 10 s at 30 frames
 #: per second, for the DVL, whose readings contradict each motion of vision anew, 2 s.
 _PATIENCE = (300, 300, 30, 5, 20, 300)
@@ -39,11 +38,9 @@ def open_gates() -> ReadingGates:
 
 @kernel
 def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, sensor):
-    """Updates a pose (4, 4) and covariance (6, 6) with a reading unless its chi-square is too high; returns if used.
-
-    If many readings in succession contradict the pose alike, and it was predicted for a while since they agreed, its
-    covariance is increased by that of the implied error.
-    """
+    """Updates a pose (4, 4) and covariance (6, 6) with a reading unless its chi-square is too high; returns if used."""
+    # many readings in succession that contradict the pose alike, predicted for a while since they agreed, increase its
+    # covariance by that of the implied error
     counts, last, n = gates.counts[sensor], gates.residuals[sensor], len(residual)
     innovation_cov = geometry.product(geometry.product(jacobian, prior), jacobian.T) + cov
     if _chi2(residual, innovation_cov) > _READING_GATES[n - 1]:
@@ -71,11 +68,9 @@ def _chi2(residual, cov):
 
 @kernel
 def kalman_update(world_from_camera, prior, residual, jacobian, cov):
-    """Returns a pose (4, 4) and its covariance (6, 6) after a Kalman update in Joseph form.
-
-    `residual` (k,), `jacobian` (k, 6) and `cov` (k, k) are the observation minus its prediction, the Jacobian of the
-    prediction with respect to an increment of the pose, and the covariance of the observation.
-    """
+    """Returns a pose (4, 4) and its covariance (6, 6) after a Kalman update in Joseph form."""
+    # `residual` (k,): observation minus its prediction; `jacobian` (k, 6): of the prediction with respect to an
+    # increment of the pose; `cov` (k, k): of the observation
     gain = _gain(prior, jacobian, cov)
     keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)
     for i in range(6):

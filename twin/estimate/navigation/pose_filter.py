@@ -74,10 +74,8 @@ def dead_reckon(
     rpy_rad: Array,
     velocity_mps: Array,
 ) -> tuple[DeadReckoningState, Array]:
-    """Advances by a frame with a visual motion and readings; also returns the motion (4, 4) fused with the DVL.
-
-    If the DVL has readings at some frames only, that is its mean per frame since the last one.
-    """
+    """Advances by a frame with a visual motion and readings; also returns the motion (4, 4) fused with the DVL."""
+    # if the DVL has readings at some frames only, that is its mean per frame since the last one
     update = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps, aiding.gates)
     online, online_cov, since_node, since_node_cov = last.online, last.cov, last.since_node, last.since_node_cov
     moved = update.motion
@@ -100,10 +98,8 @@ def predict(world_from_camera, cov, a_from_b, motion_cov):
 
 @kernel
 def undo(world_from_camera, cov, motion, motion_cov):
-    """Returns the pose (4, 4) and covariance (6, 6) before a motion and its noise, as corrected since then.
-
-    What corrections have taken from the noise of the motion is not taken again.
-    """
+    """Returns the pose (4, 4) and covariance (6, 6) before a motion and its noise, as corrected since then."""
+    # what corrections have taken from the noise of the motion is not taken again
     back = geometry.inverse(motion)
     before = cov - clip_covariance(motion_cov, cov, 0.0, 1.0)
     return geometry.compose(world_from_camera, back), geometry.transport_covariance(before, back)
@@ -126,10 +122,8 @@ def fuse_pressure_ahrs(world_from_camera, cov, aiding, height_m, rpy_rad):
 
 @kernel
 def camera_attitude(rpy_rad: Array, camera_from_body: Array, sigmas_rad: Array) -> tuple[Array, Array]:
-    """Returns the rotation world_from_camera (3, 3) of an AHRS reading (3,), and its covariance in camera axes.
-
-    The errors of roll, pitch and yaw, of standard deviations (3,), are rotations about the x, y and z axes of the body.
-    """
+    """Returns the rotation world_from_camera (3, 3) of an AHRS reading (3,), and its covariance in camera axes."""
+    # errors of roll, pitch and yaw, of standard deviations (3,), are rotations about the axes of the body
     to_camera = np.ascontiguousarray(camera_from_body[:3, :3])
     root = to_camera * sigmas_rad
     return geometry.rotation_from_rpy(rpy_rad[0], rpy_rad[1], rpy_rad[2]) @ to_camera.T, root @ root.T
@@ -232,11 +226,9 @@ class PoseFilter:
         return replace(readings, **{name: None for name, is_rejected in changed if name and is_rejected})
 
     def fuse_vertical(self, readings: Readings) -> None:
-        """Fuses the direction of the vertical, if it was measured, as far as it is more precise than the pose.
-
-        A bias of the accelerometer is in all readings. Along the axes of the predicted direction's covariance,
-        components with a variance above s^2, that of a reading, are reduced to s^2, and never below it.
-        """
+        """Fuses the direction of the vertical, if it was measured, as far as it is more precise than the pose."""
+        # a bias of the accelerometer is in all readings: along the axes of the predicted direction's covariance,
+        # components above the variance s^2 of a reading are reduced to s^2, and never below it
         if readings.up is None:
             return
         measured = self.rig.body_from_camera[:3, :3].T @ readings.up
@@ -267,10 +259,8 @@ def perpendicular_axes(direction: Array) -> Array:
 
 
 def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns the pixel (2,) of a beacon at a position (3,) in the world [m]; NaN up to a depth of 1 mm.
-
-    Also its Jacobian (2, 6) with respect to an increment [rotation, translation] (rad, m) of the pose in camera axes.
-    """
+    """Returns the pixel (2,) of a beacon at a position (3,) in the world [m]; NaN up to a depth of 1 mm."""
+    # and its Jacobian (2, 6) with respect to an increment [rotation, translation] (rad, m) of the pose in camera axes
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
     by_point = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) * rig.focals_px[:, None] / depth
@@ -279,10 +269,8 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
 
 @kernel
 def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
-    """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
-
-    The limits apply to eigenvalues of L^-1 cov L^-T, L L^T = reference; LinAlgError unless that is positive definite.
-    """
+    """Returns a covariance (n, n) limited to `lower` to `upper` times a positive definite reference covariance."""
+    # the limits apply to eigenvalues of L^-1 cov L^-T, L L^T = reference
     root = np.linalg.cholesky(reference)
     inverse_root = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse_root @ cov @ inverse_root.T)

@@ -39,10 +39,8 @@ def verticals(readings: ImuReadings, noise: ImuErrorModel) -> tuple[Array, Array
 
 @kernel
 def _filtered(times_s, rates, forces, rate_density2, rate_walk2, force_density2):
-    """Returns the vertical (n, 3) after each reading and its variance (n,) about each perpendicular axis [rad^2].
-
-    Errors of the state are [rotation in body axes, gyroscope bias]: true rotation = rotation @ exp(error).
-    """
+    """Returns the vertical (n, 3) after each reading and its variance (n,) about each perpendicular axis [rad^2]."""
+    # errors of the state are [rotation in body axes, gyroscope bias]: true rotation = rotation @ exp(error)
     n = len(times_s)
     up, variance, bias = np.empty((n, 3)), np.empty(n), np.zeros(3)
     rotation = _level(_first_vertical(times_s, rates, forces))

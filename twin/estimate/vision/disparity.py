@@ -19,16 +19,13 @@ SPECKLE_PX = 60  #: connected regions of at most this many pixels are removed as
 #: Width of the window of the contrast normalisation before matching, as a fraction of the image width. It can be large,
 #: because illumination and backscatter vary slowly; in a small one, the mean near an object depends on the background.
 NORMALISATION_WINDOW = 1 / 7
-#: Largest difference between left-to-right and right-to-left disparity [px]; above, occlusion or mismatch.
-CONSISTENCY_PX = 1.0
-#: Standard deviation of errors that the refinement does not model (interpolation, relief inside the window) [px].
-MIN_SIGMA_PX = 0.03
+CONSISTENCY_PX = 1.0  #: largest difference between left-to-right and right-to-left disparity [px]; above: occlusion
+MIN_SIGMA_PX = 0.03  #: of errors that the refinement does not model (interpolation, relief inside the window) [px]
 MAX_DISPARITY_FRACTION = 0.4  #: largest disparity that is searched, as a fraction of the image width
 #: Images are reduced by this factor to find the range of disparities; smallest number of known ones; quantile of them,
 #: and relative and absolute [px] margin beyond it at both ends.
 _REDUCTION, _LEAST_KNOWN, _QUANTILE, _MARGIN, _MARGIN_PX = 4, 100, 0.001, 0.1, 8
-#: Largest standard deviation of a valid disparity, computed as if pixel noise were independent [px].
-MAX_SIGMA_PX = 1.0
+MAX_SIGMA_PX = 1.0  #: of a valid disparity, computed as if pixel noise were independent [px]
 
 
 class Disparity(NamedTuple):
@@ -82,10 +79,8 @@ def match_densely(left: Image | Map, right: Image | Map) -> DenseMatch:
 
 
 def search_range(left: Image, right: Image) -> tuple[int, int]:
-    """Returns the smallest and the largest disparity to search in images (H, W) of normalised contrast [px].
-
-    They are found in reduced images, at a fiftieth of the time; the whole range if too few pixels match there.
-    """
+    """Returns the smallest and the largest disparity to search in images (H, W) of normalised contrast [px]."""
+    # found in reduced images, at a fiftieth of the time; the whole range if too few pixels match there
     widest_px = int(MAX_DISPARITY_FRACTION * left.shape[1])
     size = left.shape[1] // _REDUCTION, left.shape[0] // _REDUCTION
     small_left, small_right = (
@@ -101,11 +96,9 @@ def search_range(left: Image, right: Image) -> tuple[int, int]:
 
 
 def search(left: Image, right: Image, range_px: tuple[int, int], speckle_px: int = SPECKLE_PX) -> Map:
-    """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown.
-
-    The images (H, W) have normalised contrast. They are padded on the left; otherwise the left margin, as wide as the
-    largest disparity searched (their number is a multiple of 16), would have no disparity.
-    """
+    """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown."""
+    # images (H, W) of normalised contrast, padded on the left: otherwise the left margin, as wide as the largest
+    # disparity searched (their number is a multiple of 16), would have no disparity
     low, high = range_px
     count = -(-max(high - low, 1) // 16) * 16
     matcher = cv2.StereoSGBM.create(

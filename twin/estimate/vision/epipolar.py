@@ -157,11 +157,9 @@ def _correlations(residual: Map, visible: Mask, variance: float) -> tuple[float,
 
 
 def _locking_factor(residual: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor, 0 to 1, by which the correlation of the noise of neighbouring pixels reduces pixel locking.
-
-    With the correlation c between neighbours in a column, which stereo does not interpolate, interpolation halfway
-    multiplies the variance of noise by 1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3); the result is the parenthesis.
-    """
+    """Returns the factor, 0 to 1, by which the correlation of noise of neighbouring pixels reduces pixel locking."""
+    # with the correlation c between neighbours in a column, which stereo does not interpolate, interpolation halfway
+    # multiplies the variance of noise by 1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3): the parenthesis
     c = float(np.clip(_correlations(residual, visible, variance)[1], 0.0, 1.0))
     return max(1 - 1.367 * c + 0.391 * c * c - 0.022 * c**3, 0.0)
 
@@ -176,11 +174,10 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope, locking):
     """Warps the other image O to the reference image, and returns a mask (H, W) of the pixels that are visible in O.
 
     Fills `warped`, `slope` (gradient dO/dd, the mean of both images', which is less biased by noise) and `locking`
-    (expected product of residual and gradient due to noise alone, per variance of the residual).
-
-    Interpolated noise has V times the variance of a pixel, with V the sum of the squared weights (1 at a pixel, 0.64
-    halfway). The residual contains -n, the gradient (dn/dd) / 2; their product has the mean -(dV/dd) / 4 / (1 + V).
-    Unless it is subtracted, disparities halfway between two pixels are preferred.
+    (expected product of residual and gradient due to noise alone, per variance of the residual). Interpolated noise has
+    V times the variance of a pixel, with V the sum of the squared weights (1 at a pixel, 0.64 halfway). The residual
+    contains -n, the gradient (dn/dd) / 2; their product has the mean -(dV/dd) / 4 / (1 + V). Unless it is subtracted,
+    disparities halfway between two pixels are preferred.
     """
     height, width = reference.shape
     visible = np.zeros((height, width), np.bool_)
@@ -265,12 +262,9 @@ def _add_row(sums, row, j, weight):
 
 @kernel
 def _fit_planes(disparity, residual, slope, locking, noise, window, support, priors):
-    """Fits a plane to the disparities around each pixel.
-
-    The expected noise product of residual and slope is subtracted: `locking` times the mean squared residual of the
-    window, or times `noise` (H, W) if that is smaller. Returns disparity (`UNKNOWN_PX` where the fit failed), its
-    variance for a noise variance of 1, gain (`Refinement`) and mean squared residual, each (H, W).
-    """
+    """Fits planes to the disparities: disparity (`UNKNOWN_PX`: failed), variance per noise, gain, mean square."""
+    # all (H, W), gain as in `Refinement`; the expected noise product of residual and slope is subtracted: `locking`
+    # times the mean squared residual of the window, or times `noise` (H, W) if that is smaller
     height, width = disparity.shape
     half = window.size // 2
     fitted = np.full((height, width), UNKNOWN_PX, np.float32)

@@ -21,8 +21,7 @@ from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import StereoPoints
 
-#: Which estimates of pitch, yaw, roll and row offset are removed from the right images.
-CORRECTED = np.array([True, False, True, True])
+CORRECTED = np.array([True, False, True, True])  #: the estimates that are removed from right images
 #: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times those of a poor calibration.
 _PRIOR_SIGMA = np.array([0.02, 0.02, 0.02, 0.02])
 _SIGNIFICANT = 4.0  # smallest change of a row by an update of the correction [standard deviations]
@@ -34,11 +33,9 @@ _REGIONS = (4, 3)  # regions of the image along columns and rows
 
 
 def _pattern(regions: Array, estimate: Array) -> float:
-    """Returns the weighted RMS over m regions of the mean row difference that `estimate` does not explain.
-
-    The weighted sum of the squared means has the expectation m - 4 due to matching noise, which is subtracted.
-    `regions` (m, 6) are sums of weights, weighted normalised row differences and weighted derivatives (`row_jacobian`).
-    """
+    """Returns the weighted RMS over m regions of the mean row difference that `estimate` does not explain."""
+    # `regions` (m, 6): sums of weights, weighted normalised row differences and derivatives (`row_jacobian`); m - 4 is
+    # the expectation of the weighted sum of the squared means due to matching noise
     regions = regions[regions[:, 0] > 0]
     weight, rows, jacobian = regions[:, 0].copy(), regions[:, 1], regions[:, 2:].copy()
     mean = (rows - jacobian @ estimate) / weight
@@ -83,10 +80,8 @@ class EpipolarCalibration:
         return np.asarray(np.linalg.solve(self._information, self._vector), np.float64)
 
     def update(self, rig: StereoRig) -> bool:
-        """Sets pitch, roll and offset of `removed` to their estimates; returns whether they were changed.
-
-        They are if this changes a row by more than 4 standard deviations and 0.02 px in a corner of the image.
-        """
+        """Sets pitch, roll and offset of `removed` to their estimates; returns whether they were changed."""
+        # if this changes a row by more than 4 standard deviations and 0.02 px in a corner of the image
         change = (self.estimate - self.removed) * CORRECTED
         x, y = np.meshgrid(
             *(

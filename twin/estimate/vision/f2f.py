@@ -49,21 +49,18 @@ class _Located(NamedTuple):
 class FrameToFrame:
     """Frame-to-frame motion by tracking the points of the last keyframe.
 
-    Every frame is matched with a reference image: the last keyframe, or a later frame once too few of the points are
-    tracked. Structure is estimated together with motion (`two_view_motion.pair_motion`); the motion between two frames
-    follows from their poses relative to the reference. If each frame were matched with the previous one and depth taken
-    as exact, as in eq. (2) of Negahdaripour & Madjidi (2003), matching errors would accumulate: the bias of pitch was
-    1.25 mrad over fine texture (this method: 0.1 +- 0.1 mrad) and 4 mrad over coarse texture (0.5 +- 0.7 mrad).
+    Every frame is matched with the image `reference` and its points: the last keyframe (None before the first one), or
+    a later frame once too few of the points are tracked. Structure is estimated together with motion
+    (`two_view_motion.pair_motion`); the motion between two frames follows from their poses relative to the reference.
+    If each frame were matched with the previous one and depth taken as exact, as in eq. (2) of Negahdaripour & Madjidi
+    (2003), matching errors would accumulate: the bias of pitch was 1.25 mrad over fine texture (this method: 0.1 +- 0.1
+    mrad) and 4 mrad over coarse texture (0.5 +- 0.7 mrad).
 
-    A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because the
-    acceleration of a vehicle is limited, whereas a pose from few and noisy pixels may have any error. With an IMU, it
-    predicts the motion (`inertial_filter`). A step fails if
-    too few points are tracked or agree, or if the measured pose contradicts the prediction; the predicted motion is
-    then returned, with a large covariance.
-
-    Attributes:
-        reference: image with which frames are matched, and its points; None before the first keyframe.
-        filter: pose of the last frame in the reference camera, and velocity.
+    A Kalman filter of pose in the reference camera and velocity (`motion_filter`) fuses the measured pose with the
+    prediction from the velocity, because the acceleration of a vehicle is limited, whereas a pose from few and noisy
+    pixels may have any error. With an IMU, it predicts the motion (`inertial_filter`). A step fails if too few points
+    are tracked or agree, or if the measured pose contradicts the prediction; the predicted motion is then returned,
+    with a large covariance.
     """
 
     def __init__(
@@ -77,10 +74,8 @@ class FrameToFrame:
         self._common_cov = np.zeros((6, 6))  # see `cov_since_keyframe`
 
     def restart(self, image: matching.Image, points: StereoPoints, velocity: Array | None = None) -> None:
-        """Makes a new keyframe, with its normalised left image, the reference, with the strongest of its points.
-
-        A `velocity` (6,) of the camera [rad/s, m/s] that was measured otherwise replaces that of the filter.
-        """
+        """Makes a new keyframe, with its normalised left image, the reference, with the strongest of its points."""
+        # a `velocity` (6,) of the camera [rad/s, m/s] that was measured otherwise replaces that of the filter
         if velocity is not None and isinstance(self.filter, MotionFilter):
             self.filter.set_velocity(velocity)
         strongest = slice(MAX_POINTS)
@@ -142,12 +137,9 @@ class FrameToFrame:
 
     @property
     def cov_since_keyframe(self) -> Array:
-        """Returns the covariance (6, 6) of the last frame's pose relative to the last keyframe, in the frame's axes.
-
-        All frames are matched with the same points of a reference image, whose errors are common to all measured poses,
-        whereas the filter assumes independent errors. Its covariance is replaced by that of the last measured pose,
-        plus its growth since that measurement, plus the covariance of the pose of the reference image.
-        """
+        """Returns the covariance (6, 6) of the last frame's pose relative to the last keyframe, in the frame's axes."""
+        # frames are matched with the same points, whose errors are common, whereas the filter assumes independent ones;
+        # its covariance is replaced by that of the last measured pose, plus growth since then and that of the reference
         return geometry.transport_covariance(self._reference_cov, self.filter.pose) + self._common_cov + self.filter.cov
 
     def _set_reference(self, reference: _Reference) -> None:
@@ -155,11 +147,9 @@ class FrameToFrame:
         self.filter.restart()
 
     def _pyramid_levels(self, depth_m: Array) -> int:
-        """Returns the number of pyramid levels above the full image that the error of the predicted positions requires.
-
-        The tracker finds points within half its window, and each level doubles this. The error follows from the
-        filter's variances of rotation about x and y and of translation across the axis, at the median depth.
-        """
+        """Returns the number of pyramid levels above the full image that errors of predicted positions require."""
+        # the tracker finds points within half its window, doubled by each level; the error is by the variances of
+        # rotation about x and y and of translation across the axis, at the median depth
         variance = np.diag(self.filter.cov)
         across = variance[3:5] / float(np.median(depth_m)) ** 2
         error_px = _PREDICTION_SIGMAS * self.rig.focal_px * float(np.sqrt(np.max(variance[[1, 0]] + across)))
@@ -201,11 +191,9 @@ class FrameToFrame:
 
 
 def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns normalised (x, y, disparity) (n, 3) at the pixels of the left image, and their covariance (n, 3, 3).
-
-    `stereo.fuse` moves a point by half its row difference; frames are matched with the left image alone, where this
-    would appear as motion. The covariance of (x, y) is that before the fusion.
-    """
+    """Returns normalised (x, y, disparity) (n, 3) at the pixels of the left image, and their covariance (n, 3, 3)."""
+    # frames are matched with the left image alone, where half the row difference, by which `stereo.fuse` moves a point,
+    # would appear as motion; the covariance of (x, y) is that before the fusion
     measured, cov = points.measured.copy(), points.cov.copy()
     measured[:, :2] = rig.normalised(points.pixels)
     cov[:, 0, 0] += cov[:, 0, 1] ** 2 / cov[:, 1, 1]

@@ -14,10 +14,8 @@ N_COEFFICIENTS = 3 * _BASIS
 
 
 def image_errors(points: Array, half_size: Array) -> Array:
-    """Returns the derivatives (n, 3, 18) of normalised (x, y, disparity) of stereo points (n, 3) by the coefficients.
-
-    `half_size` (2,) is half the width and height of the image [focal lengths].
-    """
+    """Returns the derivatives (n, 3, 18) of normalised (x, y, disparity) of points (n, 3) by the coefficients."""
+    # `half_size` (2,) is half the width and height of the image [focal lengths]
     x, y = points[:, :2].T / half_size[:, None] * 3**0.5  # of unit variance over the image
     square_x, square_y = ((t * t - 1) / 0.8**0.5 for t in (x, y))
     basis = np.stack([np.ones_like(x), x, y, x * y, square_x, square_y], axis=1)
@@ -29,10 +27,8 @@ def image_errors(points: Array, half_size: Array) -> Array:
 
 
 def change_by_distortion(points: Array) -> Array:
-    """Returns the change (n, 3) of normalised (x, y, disparity) of stereo points per k1 that is not corrected.
-
-    Both cameras have the radial distortion x (1 + k1 r^2) (Brown 1966).
-    """
+    """Returns the change (n, 3) of normalised (x, y, disparity) of stereo points per k1 that is not corrected."""
+    # both cameras have the radial distortion x (1 + k1 r^2) (Brown 1966)
     x, y, disparity = points.T
     left, right = (column * (column**2 + y**2) for column in (x, x - disparity))
     rows = y * (x**2 + (x - disparity) ** 2 + 2 * y**2) / 2  # mean of both images
@@ -40,10 +36,7 @@ def change_by_distortion(points: Array) -> Array:
 
 
 def coefficient_sigmas(row_pattern: float) -> Array:
-    """Returns the standard deviations (18,) of the coefficients, given the RMS of a systematic row difference.
-
-    Row differences show the difference of the errors of two cameras in rows. Those of the same camera in columns are
-    taken to be as large, and those of two cameras to be independent.
-    """
+    """Returns the standard deviations (18,) of the coefficients, given the RMS of a systematic row difference."""
+    # columns of a camera are taken to err as much as rows, and two cameras independently
     one_camera = row_pattern / 2**0.5
     return np.repeat([one_camera, one_camera, one_camera / 2**0.5], _BASIS) / _BASIS**0.5

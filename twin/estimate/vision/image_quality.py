@@ -26,11 +26,9 @@ def contrast(levels: Gray) -> float:
 
 
 def repetition(image: Image, patch_px: int) -> float:
-    """Returns the highest peak of the autocorrelation of a normalised image at shifts of at least one patch side.
-
-    A peak is the largest value within a patch, so shadows and bright areas that are larger than a patch are none.
-    Natural texture stays below 0.4; repetitive texture, whose matches are ambiguous, comes close to 1.
-    """
+    """Returns the highest peak of the autocorrelation of a normalised image at shifts of at least one patch side."""
+    # the largest value within a patch, so larger shadows and bright areas are none; natural texture stays below 0.4,
+    # repetitive texture, whose matches are ambiguous, comes close to 1
     taper, weight = _taper(*image.shape)
     correlation = _autocorrelation((image.astype(np.float64) - image.mean()) * taper)
     if correlation[0, 0] <= 0:

@@ -28,13 +28,10 @@ def remove_disparities(folder: Path) -> None:
 
 
 class ImageSpool:
-    """Stores stereo pairs on disk as lossless PNG, with a cache of limited size of the last grey levels used.
+    """Stores stereo pairs as lossless PNG in a folder, created if missing, with a cache of the last grey levels used.
 
-    `gray` may be called by several threads. Methods but `close` raise OSError if files could not be read or written.
-
-    Args:
-        folder: folder of the images; created if missing.
-        binning: binning of the grey levels (the images on disk have full size).
+    The images have full size, the grey levels are binned. `gray` may be called by several threads. Methods but `close`
+    raise OSError if files could not be read or written.
     """
 
     def __init__(self, folder: Path, binning: int = 1):

@@ -7,8 +7,7 @@ from twin.core.geometry import Array
 from twin.core.records import GRAVITY_MPS2, ImuErrorModel, ImuReadings, StereoRig
 from twin.kernels import kernel
 
-#: Standard deviations at the first reading: velocity [m/s], and acceleration of the vehicle [m/s2].
-_FIRST_VELOCITY, _FIRST_ACCELERATION = 1.0, 0.3
+_FIRST_VELOCITY, _FIRST_ACCELERATION = 1.0, 0.3  # sigmas at the first reading [m/s], [m/s2]
 _GRAVITY_SIGMA = 0.01  # of the strength of gravity, which varies over the Earth by more, but is not known better [m/s2]
 #: Above the first chi2 (6 degrees of freedom) a measured pose has less weight, as errors of vision have heavier tails
 #: than those of the prediction; above the second it is rejected.
@@ -27,11 +26,8 @@ class InertialFilter:
     visual-inertial odometry"). Between measured poses the IMU predicts the motion: w = w_m - b_w, dv/dt = f_m - b_f + g
     - w x v, dg/dt = -w x g. Direction of gravity and bias of the accelerometer start as unknown as they are; a motion
     is predicted as well as their sum is known. Errors (18,) are [rotation, translation (as `MotionFilter`), velocity,
-    gravity, bias of the rates, bias of the specific forces].
-
-    Attributes:
-        pose: (4, 4) pose of the camera at the last frame in the reference camera.
-        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
+    gravity, bias of the rates, bias of the specific forces]. `pose` and `velocity`, of the camera, are as those of
+    `MotionFilter`.
     """
 
     def __init__(self, rig: StereoRig, noise: ImuErrorModel, first: ImuReadings, velocity: Array):
@@ -115,11 +111,8 @@ class InertialFilter:
 
 @kernel
 def _propagate(pose, state, cov, last_s, last_rate, last_force, times_s, rates, forces, noise, is_gap):
-    """Returns pose (4, 4), state (12,) [velocity, gravity, biases] and covariance (18, 18) at the last reading.
-
-    Rates and forces are linear between readings: the mean of two is held, and the motion is of second order. White
-    noise of density s adds s^2 dt.
-    """
+    """Returns pose (4, 4), state (12,) [velocity, gravity, biases] and covariance (18, 18) at the last reading."""
+    # the mean of two readings is held between them, the motion is of second order; white noise of density s adds s^2 dt
     state = state.copy()
     for k in range(len(times_s)):
         dt = times_s[k] - last_s

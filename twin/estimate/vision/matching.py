@@ -28,11 +28,9 @@ def luma(rgb: Image) -> Gray:
 
 
 def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
-    """Returns the slightly smoothed grey levels (H / binning, W / binning) in which patches are matched.
-
-    Luma without binning; the mean of the three bands with it, because noise limits binned images (signal to noise 1.14
-    times that of luma over `paper_coarse`).
-    """
+    """Returns the slightly smoothed grey levels (H / binning, W / binning) in which patches are matched."""
+    # luma without binning; with it the mean of the bands, as noise limits binned images (1.14 times the signal to
+    # noise)
     if binning == 1:
         levels = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     else:
@@ -41,10 +39,8 @@ def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
 
 
 def normalise(levels: Gray) -> Image:
-    """Returns grey levels (H, W) with local mean 128 and standard deviation 36, less where the texture is weak.
-
-    They depend on the window around a pixel, so they do not permit matching to a hundredth of a pixel.
-    """
+    """Returns grey levels (H, W) with local mean 128 and standard deviation 36, less where the texture is weak."""
+    # they depend on the window around a pixel, so they do not permit matching to a hundredth of a pixel
     mean, square = local_moments(levels)
     normalised = np.empty(levels.shape, np.uint8)
     _normalise(levels.ravel(), mean.ravel(), square.ravel(), normalised.ravel())
@@ -86,11 +82,9 @@ def _normalise(gray, mean, square, normalised):
 
 
 def corners(image: Image, count: int, patch_px: int) -> Points:
-    """Returns well-textured points (n, 2) [px] of a normalised image, the strongest first, not too near its border.
-
-    They are corners, spread over the image; if at least one but fewer than half of `count` are found (coarse texture,
-    whose information lies between corners), the points of a square grid with the strongest texture.
-    """
+    """Returns well-textured points (n, 2) [px] of a normalised image, the strongest first, not too near its border."""
+    # corners, or for fewer than half of `count` (coarse texture, whose information lies between corners) the points of
+    # a square grid with the strongest texture
     height, width = image.shape
     margin, block = patch_px // 2 + 2, 7
     inside = np.zeros_like(image)
@@ -111,10 +105,8 @@ def corners(image: Image, count: int, patch_px: int) -> Points:
 def track(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int = 1
 ) -> tuple[Points, Mask]:
-    """Tracks points (n, 2) [px] from one normalised image to another by Lucas-Kanade.
-
-    Returns positions, and a mask (n,) of points with the window inside that are tracked back to within half a pixel.
-    """
+    """Tracks points (n, 2) [px] between normalised images by Lucas-Kanade; also returns a mask (n,) of good ones."""
+    # those with the window inside that are tracked back to within half a pixel
     if len(points) == 0:
         return points.copy(), np.zeros(0, bool)
     points = points.astype(np.float32)
@@ -140,10 +132,8 @@ def inside(points: NDArray[np.floating], shape: tuple[int, ...], margin_px: floa
 
 
 def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
-    """Returns the factor on a covariance computed as if the points (n, 2) [px] were independent; 1 without points.
-
-    Overlapping patches share pixels: it is the summed overlap of a patch with all, averaged (design effect, Kish 1965).
-    """
+    """Returns the factor on a covariance computed as if the points (n, 2) [px] were independent; 1 without points."""
+    # overlapping patches share pixels: the mean summed overlap of a patch with all (design effect, Kish 1965)
     if len(points) == 0:
         return 1.0
     return _summed_overlap(np.ascontiguousarray(points, np.float64), float(patch_px)) / len(points)

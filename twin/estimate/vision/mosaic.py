@@ -28,15 +28,12 @@ _BLOCKS = (6, 8)  # rows and columns of image blocks; a block is about as wide a
 #: Largest ratio of the 99th percentile and the median of depths: cells of the median's resolution would else have to
 #: cover more than 25 times the area of an image, as where a camera looks along a floor.
 _MOST_DEPTH_RATIO = 5.0
-#: Largest angle of the optical axis from straight down for which heights are measured along z of the world.
-_MAX_TILT_RAD = np.deg2rad(45.0)
+_MAX_TILT_RAD = np.deg2rad(45.0)  # of the optical axis from straight down, for heights along z of the world
 
 
 def viewing_plane(world_from_camera: Array) -> Array:
-    """Returns plane_from_world (4, 4), the transformation from the world to axes in which heights are measured along z.
-
-    The identity if the camera looks down within 45 degrees, else the smallest rotation that turns its axis to -z.
-    """
+    """Returns the transformation plane_from_world (4, 4) to axes in which heights are measured along z."""
+    # the identity if the camera looks down within 45 degrees, else the smallest rotation that turns its axis to -z
     axis = world_from_camera[:3, 2]
     angle = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
     if angle <= _MAX_TILT_RAD:
@@ -61,22 +58,17 @@ class Registration(NamedTuple):
 
 
 class Mosaic:
-    """Raster of brightness, elevation [m] and keyframe number, in tiles.
+    """Raster of brightness, elevation [m] and keyframe number, in tiles, on disk in `folder`.
 
-    Args:
-        cell_m: cell size [m], about the ground sample distance; the south-west corner of cell (0, 0) is the origin of
-            the world, and row numbers increase to the north.
-        folder: folder for the tiles on disk.
+    The cell size `cell_m` [m] is about the ground sample distance. The south-west corner of cell (0, 0) is the origin
+    of the world, and row numbers increase to the north.
     """
 
     def __init__(self, cell_m: float, folder: Path):
         self.cell_m, self.cells = cell_m, TiledRaster(3, folder)
 
     def add(self, number: int, image: matching.Image, depth_m: Map, world_from_camera: Array, rig: StereoRig) -> None:
-        """Fills empty cells from a keyframe with a normalised image and depth (H, W) [m]. Raises OSError.
-
-        The mosaic must be able to represent them (`can_represent`).
-        """
+        """Fills empty cells by a normalised image and depth (H, W) [m] that it `can_represent`. Raises OSError."""
         known = depth_m[np.isfinite(depth_m)]
         farthest_m = 1.2 * float(np.quantile(known, 0.99))  # the maximum may be a mismatch
         reach_m = farthest_m * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
@@ -93,12 +85,9 @@ class Mosaic:
     ) -> Registration | None:
         """Registers a frame with the mosaic; None if too few textured cells are visible at a known depth and agree.
 
-        Raises OSError if a tile could not be read or written.
-
-        Args:
-            image, depth_m: (H, W) normalised frame, and depth from its own stereo pair, NaN where unknown.
-            world_from_camera: (4, 4) predicted pose.
-            half_window_m: half the side of the square of cells that is used, centred below the camera [m].
+        The normalised `image` (H, W) has the `depth_m` of its own stereo pair, NaN where unknown, and the predicted
+        pose `world_from_camera` (4, 4). The cells are those of a square below the camera, of half side `half_window_m`
+        [m]. Raises OSError if a tile could not be read or written.
         """
         cells = self._textured_cells(world_from_camera[:3, 3], half_window_m)
         if cells is None:
@@ -158,11 +147,9 @@ def _gradient(bright: Map, height: Map) -> Map:
 
 @kernel
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
-    """Fills the empty cells of a window from one keyframe, in place, given its south-west corner and cell size [m].
-
-    A cell receives the mean height of its pixels, and the brightness at the projection of its centre: that of its
-    pixels, which are not at the centre, would bias registered positions by 5 mm.
-    """
+    """Fills the empty cells of a window from one keyframe, in place, given its south-west corner and cell size [m]."""
+    # mean height of the pixels, and brightness at the projection of the centre: that of the pixels, which are not at
+    # the centre, would bias registered positions by 5 mm
     total = np.zeros(height.shape, np.float32)
     count = np.zeros(height.shape, np.int32)
     rows, cols = height.shape
@@ -194,12 +181,9 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
 
 @kernel
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
-    """Linearises the brightness residuals (cell minus frame) of the n cells visible in the frame at a known depth.
-
-    Returns:
-        Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the depth
-        from the mosaic and from the frame; residuals (m,) and their image blocks; mask (n,) of the m cells used.
-    """
+    """Linearises the brightness residuals (cell minus frame) of the n cells visible in the frame at a known depth."""
+    # Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the depth
+    # from the mosaic and from the frame; residuals (m,) and their image blocks; mask (n,) of the m cells used
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS
     jacobian, frame_jacobian, residuals, block = np.empty((n, 6)), np.empty((n, 6)), np.empty(n), np.empty(n, np.int64)
@@ -237,10 +221,8 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
 
 @kernel
 def _normal_equations(jacobian, frame_jacobian, residuals, block):
-    """Returns normal matrix, right-hand side, its covariance from the scatter over image blocks, and robust sigma.
-
-    Huber weights; the Jacobian with the frame's depth gives instrumental variables, free of the mosaic's depth errors.
-    """
+    """Returns normal matrix, right-hand side, its covariance from the scatter over image blocks, and robust sigma."""
+    # Huber weights; the Jacobian with the frame's depth gives instrumental variables, free of the mosaic's depth errors
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     if len(jacobian) < 6:
         return normal, right, scatter, 0.0

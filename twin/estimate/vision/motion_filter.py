@@ -5,8 +5,7 @@ from twin.core.geometry import Array
 from twin.core.records import ImuReadings
 from twin.core.settings import braking_factor
 
-#: Standard deviation of the acceleration of an underwater vehicle [rotation, translation] (rad/s2, m/s2).
-_ACCELERATION = np.full(6, 2.0)
+_ACCELERATION = np.full(6, 2.0)  # sigma of an underwater vehicle [rotation, translation] (rad/s2, m/s2)
 _FIRST_VELOCITY = np.ones(6)  # standard deviation of the velocity before it is measured [rad/s, m/s]
 _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a measured pose; above it, the measurement is rejected
 
@@ -15,12 +14,10 @@ class MotionFilter:
     """Extended Kalman filter of the camera's pose in a reference camera and of its velocity, from frame to frame.
 
     Nearly constant velocity (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2): where the image determines a pose
-    poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. Errors of the pose
-    are motions [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
-
-    Attributes:
-        pose: (4, 4) pose of the last frame in the reference camera.
-        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
+    poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. `pose` (4, 4) is
+    that of the last frame in the reference camera, its errors are motions [rotation, translation] (rad, m) in the axes
+    of the camera: pose = true pose @ exp(error). `velocity` (6,) is the twist of the camera in its own axes [rad/s,
+    m/s].
     """
 
     def __init__(self, stops_if_blind: bool = True):
@@ -72,10 +69,8 @@ class MotionFilter:
 
 
 def _acceleration_cov(interval_s: float) -> Array:
-    """Returns the covariance (12, 12) of pose and velocity that white-noise acceleration adds within an interval.
-
-    Constant acceleration (Bar-Shalom et al. 2001, section 6.3.2) would reverse the velocity error at each frame.
-    """
+    """Returns the covariance (12, 12) of pose and velocity that white-noise acceleration adds within an interval."""
+    # a constant one (Bar-Shalom et al. 2001, section 6.3.2) would reverse the velocity error at each frame
     velocity = np.diag((_ACCELERATION * interval_s) ** 2)
     shared = velocity * (interval_s / 2)
     return np.block([[velocity * (interval_s**2 / 3), shared], [shared, velocity]])

@@ -41,11 +41,9 @@ class LinearisedObservations(NamedTuple):
 
 @kernel
 def change_by_yaw(points: Array) -> Array:
-    """Returns the change (n, 3) of normalised (x, y, disparity) of a stereo pair per yaw of the right camera [rad].
-
-    At the normalised column x of the right image, the column changes by -(1 + x^2) and the row by -x y (Hartley &
-    Zisserman 2004, section 6.1); the constraint of equal rows takes the mean of both rows.
-    """
+    """Returns the change (n, 3) of normalised (x, y, disparity) of a stereo pair per yaw of the right camera [rad]."""
+    # at column x of the right image, -(1 + x^2) in the column and -x y in the row (Hartley & Zisserman 2004, section
+    # 6.1); the constraint of equal rows takes the mean of both rows
     change = np.zeros((len(points), 3))
     for i in range(len(points)):
         x = points[i, 0] - points[i, 2]
@@ -80,11 +78,8 @@ def normal_equations(jacobian, weight, residual):
 
 @kernel
 def transfer(points_b, a_from_b, baseline):
-    """Transfers points measured in pair b, normalised (x, y, disparity) (n, 3), to pair a.
-
-    Returns (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an increment
-    [rotation, translation] (rad, m) of the motion in the axes of b (n, 3, 6).
-    """
+    """Transfers normalised (x, y, disparity) (n, 3) from pair b to a; with derivatives by point and motion."""
+    # (n, 3, 3) by the point in b, (n, 3, 6) by an increment [rotation, translation] (rad, m) of the motion in its axes
     n = len(points_b)
     points_a, jacobian_point, jacobian_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
     rotation, translation = np.empty((3, 3)), np.empty(3)  # translation in baselines
@@ -155,11 +150,9 @@ def _invert(m, out):
 
 @kernel
 def motion_normal_equations(observations, weight):
-    """Returns the normal equations of the p unknowns of the motion, with the structure eliminated.
-
-    These are the normal matrix (p, p), the right-hand side (p,), and its derivative (p, 3) with respect to biases of x,
-    y and disparity in a that are the same at all points. Points of robust weight (n,) 0 are skipped.
-    """
+    """Returns the normal equations of the p unknowns of the motion, with the structure eliminated."""
+    # normal matrix (p, p), right-hand side (p,), and its derivative (p, 3) with respect to biases of x, y and disparity
+    # in a that are the same at all points; points of robust weight (n,) 0 are skipped
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
     count = jacobian.shape[2]
     normal, right, bias_jacobian = np.zeros((count, count)), np.zeros(count), np.zeros((count, 3))

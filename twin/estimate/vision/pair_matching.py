@@ -30,9 +30,8 @@ class MatchedPair(NamedTuple):
 class PairMatcher:
     """Matches a node with earlier nodes, at the scale of the grey levels in `spool`, and estimates their motions.
 
-    Attributes:
-        removed_yaw: yaw of the right camera for which the images of a keyframe were corrected, by frame index [rad].
-        twists: twist of the camera (6,) at a keyframe, by frame index, for the correction of a rolling shutter.
+    By frame index of a keyframe, `removed_yaw` is the yaw of the right camera [rad] for which its images were
+    corrected, and `twists` the twist (6,) of the camera, for the correction of a rolling shutter.
     """
 
     def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
@@ -110,11 +109,9 @@ class PairMatcher:
         return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
 
     def motion(self, node: Keyframe, other: Keyframe, matched: MatchedPair) -> two_view_motion.Motion | None:
-        """Estimates the pose of `node` in the axes of `other` from their matched points, jointly with the structure.
-
-        The estimation starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the motion between the
-        current poses if that fails. None if too few points are matched or too few of them are inliers.
-        """
+        """Estimates the pose of `node` in the axes of `other` from their matched points, jointly with the structure."""
+        # starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the current poses if that fails;
+        # None if too few points are matched or inliers
         a, b = (self._corrected(z, node.yaw_rad, at) for z, at in zip(matched.measured[:2], (other, node), strict=True))
         measured = matched.measured._replace(a=a, b=b)
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera

@@ -83,10 +83,9 @@ def match_templates(
 ) -> PatchMatches:
     """Matches patches of one image in another, from the coarsest common level of the pyramids down to the full image.
 
-    Args:
-        templates, target: patches and spline coefficients per pyramid level.
-        guess: (n, 2) expected positions in the target [px]; accurate to about two pixels of the coarsest level.
-        warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
+    `templates` and `target` are patches and spline coefficients per pyramid level, `guess` (n, 2) expected positions in
+    the target [px], accurate to about two pixels of the coarsest level, `warp` (n, 2, 2) the derivative of target
+    pixels with respect to source pixels over each patch.
     """
     points, warp = guess.astype(np.float64), np.ascontiguousarray(warp)  # one memory layout: `_match` is compiled once
     correlation, cov = np.full(len(guess), -1.0), np.zeros((len(guess), 2, 2))
@@ -111,12 +110,10 @@ def disparity_slope(disparity_px: Map, points: NDArray[np.floating], patch_px: i
 
 
 def locking_shifts(pixels: NDArray[np.floating], warp: Array, patch_px: int) -> Array:
-    """Returns the shifts (n, 2) [px] of positions `pixels` (n, 2) due to pixel locking with an amplitude of 1 px.
-
-    A match at column u and row v [px] is shifted by -A sin(2 pi u) and -A sin(2 pi v) (Schreier, Braasch & Sutton 2000,
-    Opt. Eng. 39). Where a patch of side s is warped (`match_templates`), its pixels' biases partly cancel: A along an
-    image axis is multiplied by sinc(s d1) sinc(s d2), with (d1, d2) the row for this axis of "warp minus identity".
-    """
+    """Returns the shifts (n, 2) [px] of positions `pixels` (n, 2) due to pixel locking with an amplitude of 1 px."""
+    # at column u and row v, -A sin(2 pi u) and -A sin(2 pi v) (Schreier, Braasch & Sutton 2000, Opt. Eng. 39); where a
+    # patch of side s is warped, its pixels' biases partly cancel: A along an image axis is multiplied by sinc(s d1)
+    # sinc(s d2), with (d1, d2) the row for this axis of "warp minus identity"
     varying = np.sinc(patch_px * (warp - np.eye(2)))
     return -np.sin(2 * np.pi * pixels) * varying[:, :, 0] * varying[:, :, 1]
 
@@ -259,10 +256,8 @@ def _sample(spline, u0, v0, warp, half, values):
 
 @kernel(fastmath=_REASSOCIATE)
 def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance):
-    """Matches patches at one pyramid level, in its pixels, until a step (|column| + |row|) is below `tolerance`.
-
-    Returns positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zeros where it failed.
-    """
+    """Matches patches at one pyramid level, in its pixels, until a step (|column| + |row|) is below `tolerance`."""
+    # gives positions (n, 2), correlations (n,), covariances (n, 2, 2); the guess, -1 and zeros where it failed
     n = (2 * half + 1) ** 2
     height, width = spline.shape
     count = len(guess)

@@ -27,10 +27,8 @@ class RepeatedImages:
         self._time_s = np.nan
 
     def status(self, frame: Frame, twist: Array, interval_s: float) -> str:
-        """Returns "ok", or which camera is frozen; the same answer if the frame is the last one again.
-
-        `twist` (6,) is the velocity of the camera [rad/s, m/s] at the last frame. The right image may be missing.
-        """
+        """Returns "ok", or which camera is frozen; the same answer if the frame is the last one again."""
+        # `twist` (6,): velocity of the camera [rad/s, m/s] at the last frame; the right image may be missing
         if frame.time_s != self._time_s:
             self._time_s = frame.time_s
             moving = bool(np.abs(twist).max() > _LARGEST_DECELERATION * interval_s)

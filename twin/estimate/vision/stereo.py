@@ -64,11 +64,9 @@ class Keyframe:
     accumulated_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def motion_cov(self, earlier: Keyframe, world_from_camera: Array | None = None) -> Array:
-        """Returns the covariance (6, 6) of the motion since an earlier keyframe [rotation, translation] (rad, m).
-
-        It is in the axes of this keyframe, or of `world_from_camera` (4, 4); too large after global alignments, which
-        do not decrease `accumulated_cov`.
-        """
+        """Returns the covariance (6, 6) of the motion since an earlier keyframe [rotation, translation] (rad, m)."""
+        # in the axes of this keyframe, or of `world_from_camera` (4, 4); too large after global alignments, which do
+        # not decrease `accumulated_cov`
         pose = self.world_from_camera if world_from_camera is None else world_from_camera
         from_world = geometry.adjoint(geometry.inverse(pose))
         return from_world @ (self.accumulated_cov - earlier.accumulated_cov) @ from_world.T
@@ -92,22 +90,17 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
 
 
 def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> Array:
-    """Returns the shifts (n, 3) of the results of `fuse` that shifts (n, 2) of its input positions [px] cause.
-
-    The constraint of equal rows moves each row by half their difference, and the columns by regression on the rows; the
-    coefficient follows from the covariance (n, 3, 3) that `fuse` returned.
-    """
+    """Returns the shifts (n, 3) of the results of `fuse` that shifts (n, 2) of its input positions [px] cause."""
+    # rows move by half their difference, columns by regression on the rows, by the covariance (n, 3, 3) of `fuse`
     slope, half = fused_cov[:, 0, 1] / fused_cov[:, 1, 1], (left[:, 1] - right[:, 1]) / 2
     x, disparity = left[:, 0] - slope * half, left[:, 0] - right[:, 0] - 2 * slope * half
     return np.column_stack([x, left[:, 1] - half, disparity]) / rig.focal_px
 
 
 def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
-    """Returns the ratio of the measured standard deviation of row differences to the expected one; at least 1.
-
-    Row differences minus their median (calibration errors) measure the matching noise. The ratio is 1.4826 times the
-    median of the absolute normalised ones; 1 for fewer than 30 points, or within two standard errors of 1.17 / sqrt(n).
-    """
+    """Returns the ratio of the measured standard deviation of row differences to the expected one; at least 1."""
+    # 1.4826 times the median of the absolute normalised ones minus their median (calibration errors); 1 for fewer than
+    # 30 points, or within two standard errors of 1.17 / sqrt(n)
     n = len(left)
     if n < _MIN_ROW_DIFFERENCES:
         return 1.0
@@ -127,10 +120,8 @@ def margin_px(patch_px: int) -> int:
 
 
 def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> Mask:
-    """Returns a mask (n,) of the patches, predicted at `pixels` (n, 2), that stay inside despite matching errors.
-
-    Measured positions would prefer errors that point away from the border (-0.02 px of disparity over coarse texture).
-    """
+    """Returns a mask (n,) of the patches, predicted at `pixels` (n, 2), that stay inside despite matching errors."""
+    # measured positions would prefer errors away from the border (-0.02 px of disparity over coarse texture)
     return matching.inside(pixels, (rig.height_px, rig.width_px), margin_px(patch_px))
 
 
@@ -146,10 +137,8 @@ def corners_with_disparity(left: matching.Gray, dense_px: Map, settings: Estimat
 def match_stereo_points(
     left: matching.Gray, right: matching.Gray, dense_px: Map, rig: StereoRig, settings: EstimatorSettings
 ) -> StereoPoints:
-    """Matches corners of the left image in the right one, to sub-pixel accuracy, from a refined disparity (H, W) [px].
-
-    Grey levels are those of `matching.gray`; the rig is that of the images, with square pixels.
-    """
+    """Matches corners of the left image in the right one, to sub-pixel accuracy, from refined disparity (H, W) [px]."""
+    # grey levels are those of `matching.gray`; the rig is that of the images, with square pixels
     patch_px = settings.patch_px
     pixels, disparity_px = corners_with_disparity(left, dense_px, settings)
     slope = patches.disparity_slope(dense_px, pixels, patch_px)
@@ -171,12 +160,9 @@ def match_stereo_points(
 
 
 def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
-    """Returns the smallest binning at which over two thirds of the corners are matched, else that with the most.
-
-    Over coarse texture many corners are noise: over texels of 12 pixels, 35 to 60 % are matched at full size, 88 to 96
-    % with binning by 2 or 4; over fine texture 95 to 99 % without. Larger patches alone do not help. Only binnings that
-    divide the width and the height of the images are tried.
-    """
+    """Returns the smallest binning at which over two thirds of the corners are matched, else that with the most."""
+    # over coarse texture many corners are noise: over texels of 12 pixels, 35 to 60 % are matched at full size, 88 to
+    # 96 % with binning by 2 or 4; over fine texture 95 to 99 % without. Larger patches alone do not help.
     best, best_fraction = 1, 0.0
     for binning in BINNINGS:
         if rig.width_px % binning or rig.height_px % binning:

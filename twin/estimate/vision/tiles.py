@@ -12,10 +12,7 @@ _MAX_TILES = 64  # 50 MB with three layers; an image covers about 20 tiles
 
 
 class TiledRaster:
-    """Raster of float32 layers without limits; unwritten cells are NaN.
-
-    The `max_tiles` most recently used square tiles are in memory, the others in `folder`, which is created when needed.
-    """
+    """Raster of float32 layers, NaN where unwritten; all but the last `max_tiles` tiles used are in `folder`."""
 
     def __init__(self, n_layers: int, folder: Path, max_tiles: int = _MAX_TILES):
         self.n_layers, self.folder, self.max_tiles = n_layers, folder, max_tiles

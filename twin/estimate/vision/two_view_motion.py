@@ -218,21 +218,17 @@ def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
 
 
 def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -> DisparityOffset | None:
-    """Returns the offset of all disparities [focal lengths], an additional unknown of the last Gauss-Newton step.
-
-    The derivative of the residual z_a - g(z_b) with respect to an offset of both disparities is u - G u, with u the
-    unit vector along the disparity. None if the offset is not observable.
-    """
+    """Returns the offset of all disparities [focal lengths], an additional unknown of the last Gauss-Newton step."""
+    # the derivative of the residual z_a - g(z_b) by an offset of both disparities is u - G u, with u the unit vector
+    # along the disparity; None if the offset is not observable
     by_offset = np.array([0.0, 0.0, 1.0]) - normals.observations.jacobian_point[:, :, 2]
     found = _additional_unknown(normals, by_offset, settings)
     return None if found is None else DisparityOffset(*found[:2])
 
 
 def _yaw(normals: _WeightedNormals, measured: PairMeasurements, settings: PairMotionSettings) -> YawEffect | None:
-    """Returns the yaw of the right camera, as `_disparity_offset`, and its effect on the motion.
-
-    The derivative is e_a - G e_b, with e of `change_by_yaw`.
-    """
+    """Returns the yaw of the right camera, as `_disparity_offset`, and its effect on the motion."""
+    # the derivative is e_a - G e_b, with e of `change_by_yaw`
     moved = np.einsum("nij,nj->ni", normals.observations.jacobian_point, change_by_yaw(measured.b))
     found = _additional_unknown(normals, change_by_yaw(measured.a) - moved, settings)
     return None if found is None else YawEffect(*found)
@@ -241,11 +237,9 @@ def _yaw(normals: _WeightedNormals, measured: PairMeasurements, settings: PairMo
 def _distortion(
     normals: _WeightedNormals, points_a: Array, points_b: Array, settings: PairMotionSettings
 ) -> DistortionError | None:
-    """Returns the error of k1, estimated with the yaw, which changes points at one depth in nearly the same way.
-
-    The derivatives are those at the adjusted points (n, 3): the noise of measured ones is correlated with the
-    residuals, so that k1 was too large by 0.01 for a noise of 0.05 px, and grew with its square.
-    """
+    """Returns the error of k1, estimated with the yaw, which changes points at one depth in nearly the same way."""
+    # derivatives at the adjusted points (n, 3): the noise of measured ones is correlated with the residuals, so that k1
+    # was too large by 0.01 for a noise of 0.05 px, and grew with its square
     observations = normals.observations
     a, b = (np.stack([change_by_distortion(z), change_by_yaw(z)], axis=2) for z in (points_a, points_b))
     derivative = a - observations.jacobian_point @ b
@@ -277,11 +271,7 @@ def _by_image_errors(
 def _additional_unknown(
     normals: _WeightedNormals, derivative: Array, settings: PairMotionSettings
 ) -> tuple[float, float, Array] | None:
-    """Returns an unknown that changes the residuals by its `derivative` (n, 3); None if it cannot be estimated.
-
-    Returns:
-        The unknown, its standard deviation, and the change (6,) of the motion per unit of the unknown.
-    """
+    """Returns an unknown by its `derivative` (n, 3) of residuals, its sigma, and the motion (6,) per unit; or None."""
     observations, weight = normals.observations, normals.weight
     weighted = weight[:, None] * np.einsum("nrc,nr->nc", observations.information, derivative)
     coupling = np.einsum("nc,ncp->p", weighted, observations.jacobian_motion)

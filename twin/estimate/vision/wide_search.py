@@ -34,10 +34,8 @@ def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig
 
 
 def agrees(found: Array, found_cov: Array, predicted: Array, cov: Array) -> bool:
-    """Returns whether a measured motion lies within the errors of itself and its prediction (chi-square, 99.99 %).
-
-    Repeated texture may shift it by a period. Negative eigenvalues of `cov`, a difference, count as zero.
-    """
+    """Returns whether a measured motion lies within the errors of itself and its prediction (chi-square, 99.99 %)."""
+    # repeated texture may shift it by a period; negative eigenvalues of `cov`, a difference, count as zero
     error = geometry.log(geometry.inverse(predicted) @ found)
     values, axes = np.linalg.eigh((cov + cov.T) / 2)
     both = axes * np.maximum(values, 0) @ axes.T + found_cov
@@ -47,11 +45,9 @@ def agrees(found: Array, found_cov: Array, predicted: Array, cov: Array) -> bool
 def coarse_motion(
     node: matching.Gray, other: matching.Gray, points: StereoPoints, rig: StereoRig, patch_px: int
 ) -> Array | None:
-    """Returns the pose (4, 4) of the left camera of a node in that of another node; None if too few features agree.
-
-    SIFT features (Lowe 2004) of the left images get their depth from the nearest stereo point within `patch_px`; the
-    pose is that of perspective-n-point with RANSAC. Its error of a pixel or two suffices to predict a link.
-    """
+    """Returns the pose (4, 4) of the left camera of a node in that of another node; None if too few features agree."""
+    # SIFT features (Lowe 2004) get their depth from the nearest stereo point within `patch_px`; perspective-n-point
+    # with RANSAC, whose error of a pixel or two suffices to predict a link
     sift = cv2.SIFT.create(nfeatures=_MOST_FEATURES)
     node_px, node_descriptors = _features(sift, node)
     other_px, other_descriptors = _features(sift, other)

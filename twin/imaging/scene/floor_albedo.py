@@ -91,10 +91,8 @@ def _paint(surface, view, origin, focal, depth, albedo, first, end):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _find_facets(height, spacing, view, origin, focal, y, depth, work, weight, cells):
-    """Replaces 1 / depth by depth; fills the rows DEPTH to ROW of `work`, and row 1 of `cells` with the cells.
-
-    The weights are 1, or 0 where there is no floor.
-    """
+    """Replaces 1 / depth by depth; fills the rows DEPTH to ROW of `work`, and row 1 of `cells` with the cells."""
+    # the weights are 1, or 0 where there is no floor
     rows, cols = height.shape
     zero, one, per_cell = np.float32(0), np.float32(1), np.float32(1) / spacing
     west, south = -np.float32(origin[0]), -np.float32(origin[1])
@@ -128,12 +126,9 @@ def _find_facets(height, spacing, view, origin, focal, y, depth, work, weight, c
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _find_footprints(view, focal, y, work, n):
-    """Fills the rows BELOW to DOWN_Z of `work` for its first n pixels.
-
-    The facet is the plane through the point with the normal N = (fall_x, fall_y, -1) in the axes east, north, down.
-    With the ray d of a pixel at the depth z, and d' its change to the next pixel, the point moves by
-    z (d' - d N.d' / N.d).
-    """
+    """Fills the rows BELOW to DOWN_Z of `work` for its first n pixels."""
+    # the facet is the plane with the normal N = (fall_x, fall_y, -1) in the axes east, north, down; with the ray d of a
+    # pixel at the depth z, and d' its change to the next pixel, the point moves by z (d' - d N.d' / N.d)
     ax, ay, az, bx, by, bz = view[0, 0], view[1, 0], view[2, 0], view[0, 1], view[1, 1], view[2, 1]
     x0, y0, z0 = view[0, 1] * y + view[0, 2], view[1, 1] * y + view[1, 2], view[2, 1] * y + view[2, 2]
     one, least, down_0, per_px = np.float32(1), np.float32(LEAST_COSINE), view[2, 3], np.float32(1) / focal

@@ -45,10 +45,8 @@ def _bound(least_or_most: np.ufunc, height: NDArray[np.float32]) -> NDArray[np.f
 def draw_floor(
     grid: FloorGrid, camera_from_grid: Array, view: Projection, inverse_depth: NDArray[np.float32], rows: slice
 ) -> None:
-    """Draws rows of the floor into an image (H, W) of 1 / depth [1/m] in place where it is nearer than what that shows.
-
-    `camera_from_grid` (3, 4) maps column, row and height [m] of a node to the axes of the camera [m].
-    """
+    """Draws rows of the floor into an image (H, W) of 1 / depth [1/m], in place, where it is nearer."""
+    # `camera_from_grid` (3, 4) maps column, row and height [m] of a node to the axes of the camera [m]
     first, end = rows.start, rows.stop
     in_camera = view_planes(view._replace(cy_px=view.cy_px - first), (end - first, inverse_depth.shape[1]))
     planes = in_camera[:, :3] @ camera_from_grid
@@ -118,10 +116,8 @@ def _project(height, matrix, first_row, first_col, rows, cols, camera, place):
 
 @kernel(fastmath=_FAST, error_model="numpy", forceinline=True)
 def _list_triangles(place, rows, cols, window, kept):
-    """Lists the triangles of a block that face the camera and may cover a pixel centre; returns their number.
-
-    A triangle is twice the number of its south-west node, plus 1 for the north-western one of a cell.
-    """
+    """Lists the triangles of a block that face the camera and may cover a pixel centre; returns their number."""
+    # a triangle is twice the number of its south-west node, plus 1 for the north-western one of a cell
     n = 0
     for r in range(rows):
         u, v, u_north, v_north = place[0, r], place[1, r], place[0, r + 1], place[1, r + 1]

@@ -50,10 +50,8 @@ def material_of(terrain: TerrainConfig) -> Material | None:
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def reflectance(material, albedo, mu_i, mu_o, phase):
-    """Returns the bidirectional reflectance [1/sr], in single precision, for an albedo of 0 to 1.
-
-    `mu_i`, `mu_o` are the cosines of incidence and of view, above 0, `phase` that of the phase angle.
-    """
+    """Returns the bidirectional reflectance [1/sr], in single precision, for an albedo of 0 to 1."""
+    # `mu_i`, `mu_o`: cosines of incidence and of view, above 0; `phase`: that of the phase angle
     kind, a, b, specular, alpha_squared = material
     one, two, zero = np.float32(1), np.float32(2), np.float32(0)
     tiny = np.float32(1e-6)
@@ -79,11 +77,9 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, reflected):
-    """Adds the light [cd/m2] of one lamp that a row of W pixels reflects, before loss on the way, to `reflected`.
-
-    `lamp` starts with its position in camera axes [m], `albedo` (W, 3) is uint8, `here` (W,) the depth [m], `normal`
-    (3, W) in camera axes, `arriving` (3, W) the illuminance by the lamp, attenuated on its path to the floor [lx].
-    """
+    """Adds the light [cd/m2] of one lamp that a row of W pixels reflects, before loss on the way, to `reflected`."""
+    # `lamp` starts with its position in camera axes [m]; `albedo` (W, 3) uint8; `here` (W,) depth [m]; `normal` (3, W)
+    # in camera axes; `arriving` (3, W) illuminance by the lamp, attenuated on its path to the floor [lx]
     one, half, tiny = np.float32(1), np.float32(0.5), np.float32(1e-4)
     for u in range(here.size):
         if arriving[0, u] + arriving[1, u] + arriving[2, u] <= np.float32(0):

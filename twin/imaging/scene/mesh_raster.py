@@ -157,13 +157,11 @@ def _draw(
 
 @kernel(error_model="numpy")
 def _list_parts(parts, matrix, projection, window, closed, shown):
-    """Writes the numbers of the parts that the image may show to `shown`; returns how many there are.
-
-    The others are nearer than the near plane, outside the `window` (first column, end, first row, end), or of a closed
-    mesh and facing away. With the centre c of the part, w = c - e from a camera at e, the angle b between w and the
-    axis of the cone of normals, and the angle a of this cone, m (p - e) >= |w| cos(a + b) - behind_m (see `Parts`) for
-    the corner p and normal m of every triangle; in a parallel view, w is the direction of view.
-    """
+    """Writes the numbers of the parts that the image may show to `shown`; returns how many there are."""
+    # the others are nearer than the near plane, outside the `window` (first column, end, first row, end), or of a
+    # closed mesh and facing away: with the centre c of the part, w = c - e from a camera at e, the angle b between w
+    # and the axis of the cone of normals, and the angle a of this cone, m (p - e) >= |w| cos(a + b) - behind_m (see
+    # `Parts`) for the corner p and normal m of every triangle; in a parallel view, w is the direction of view
     centre, half, axis, cos_sin, behind = parts
     focal, cx, cy, near, perspective = projection
     left, right, top, bottom = window
@@ -267,12 +265,10 @@ def _rectangle(ua, va, ub, vb, uc, vc, window):
 def _list_pixels(
     faces, kept, n_kept, k, row, place, window, block_face, block_u, block_v, weight_b, weight_c, hits
 ):  # fmt: skip
-    """Lists the pixel centres that the triangles `kept[k]` to `kept[n_kept - 1]` cover, from row `row` of the first on.
-
-    For each block of 2 x 2 pixels it writes triangle, first column and row, and the weights of the second and third
-    corner. A hit is 4 times the number of a block plus that of a pixel in it. Returns the number of hits, and `k` and
-    `row` to go on from if the arrays are full.
-    """
+    """Lists pixels that the triangles `kept[k]` to `kept[n_kept - 1]` cover, from row `row` of the first on."""
+    # by block of 2 x 2 pixels: triangle, first column and row, weights of the second and third corner; a hit is 4 times
+    # the number of a block plus that of a pixel in it. Returns the number of hits, and `k` and `row` to go on from if
+    # the arrays are full.
     u, v = place[0], place[1]
     n_blocks, n_hits = 0, 0
     while k < n_kept:

@@ -11,10 +11,8 @@ LEAST_COSINE = 0.1  #: smallest cosine of the angle between ray and normal; smal
 
 
 def paint_textures(target: Target, projection: Projection, textures: Textures, of_label: NDArray[np.int32]) -> None:
-    """Draws textures into `target.albedo` after `draw_meshes`; none of the images of `target` is None.
-
-    `of_label` (labels,) is the number of the texture of the mesh that `Target.label` names; -1: none.
-    """
+    """Draws textures into `target.albedo` after `draw_meshes`; none of the images of `target` is None."""
+    # `of_label` (labels,) is the number of the texture of the mesh that `Target.label` names; -1: none
     _paint(*target, projection, *textures, of_label)
 
 

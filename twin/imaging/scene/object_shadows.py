@@ -42,10 +42,8 @@ class ObjectShadows:
         self, lit: NDArray[np.uint8], depth: Depth, view: ObjectView, world_from_camera: Array,
         moment: tuple[int, float],
     ) -> None:  # fmt: skip
-        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away.
-
-        `depth` is that of floor and objects; `moment`: camera (0 left, 1 right), and time of the survey [s].
-        """
+        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away."""
+        # `depth` is that of floor and objects; `moment`: camera (0 left, 1 right), and time of the survey [s]
         camera, time_s = moment
         points = self._sampled_points(depth)
         if not len(points):
@@ -127,10 +125,8 @@ def _axes_along(forward: Array) -> Array:
 
 @kernel(error_model="numpy")
 def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first, end):
-    """Sets `lit` (H, W) to 0 in rows where the map `nearest` shows an object that occludes, or objects face away.
-
-    The bias is one pixel on the floor, BIAS_PX (1 + t) on objects, t the tangent of incidence up to STEEPEST.
-    """
+    """Sets `lit` (H, W) to 0 in rows where the map `nearest` shows an object that occludes, or objects face away."""
+    # the bias is one pixel on the floor, BIAS_PX (1 + t) on objects, t the tangent of incidence up to STEEPEST
     height, width = depth.shape
     x = (np.arange(width) - 0.5 * (width - 1)) / focal
     cell, reach, bias = np.empty(width, np.int32), np.empty(width), np.empty(width)

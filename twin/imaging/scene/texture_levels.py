@@ -56,11 +56,9 @@ def level_of(size_2):
 
 @kernel(fastmath=_FAST, error_model="numpy", forceinline=True)
 def add_samples(texture, x, y, level, weight, at, n, shares, cells, total):
-    """Adds samples to the colours (3 W,) of pixels, interpolated linearly between texels and levels.
-
-    The first n columns (finest texels), rows, levels, weights, and numbers of the pixels are those of the samples;
-    `shares` (3, n) float32 and `cells` (3, n) int32 are overwritten. Beyond its border, a texture repeats its texels.
-    """
+    """Adds samples to the colours (3 W,) of pixels, interpolated linearly between texels and levels."""
+    # the first n columns (finest texels), rows, levels, weights, and numbers of the pixels are those of the samples;
+    # `shares` (3, n) float32 and `cells` (3, n) int32 are overwritten; beyond its border, a texture repeats its texels
     finest, coarser, table = texture
     zero, one, half, two = np.float32(0), np.float32(1), np.float32(0.5), np.float32(2)
     high, wide, last = np.float32(table[0, 1]), np.float32(table[0, 2]), max(np.float32(len(table) - 1.001), zero)

@@ -52,10 +52,8 @@ def wall_surface(terrain: Terrain) -> WallSurface:
 def paint_walls_from_above(
     terrain: Terrain, surface: WallSurface, albedo: Image, x_m: Coordinates, y_m: Coordinates, step_m: float
 ) -> None:
-    """Blends the texture of the walls into a parallel view (rows, cols, 3) of a floor from above, in place.
-
-    x (cols,) and y (rows,) of its pixels [m] are `step_m` apart.
-    """
+    """Blends the texture of the walls into a parallel view (rows, cols, 3) of a floor from above, in place."""
+    # x (cols,) and y (rows,) of its pixels [m] are `step_m` apart
     floor = terrain.height_m, terrain.highest_m, terrain.spacing_m
     _paint_from_above(surface, *floor, albedo, x_m - terrain.west_m, y_m - terrain.south_m, np.float32(step_m))
 
@@ -97,11 +95,9 @@ def _paint_from_above(surface, height, highest, spacing, albedo, east, north, st
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def add_walls(surface, work, cells, n, weight, total):
-    """Adds the colours of walls to n listed pixels of a row (3 W,), and takes their share from its weights (W,).
-
-    The first two rows of `cells` (6, W) int32 are the columns of the pixels in the image, and the numbers of their
-    cells in `surface.weights`; `work` (N_ROWS, W) has their rows EAST to DOWN_Z (`pixel_rows`).
-    """
+    """Adds the colours of walls to n listed pixels of a row (3 W,), and takes their share from its weights (W,)."""
+    # rows of `cells` (6, W) int32: columns of the pixels in the image, numbers of their cells in `surface.weights`;
+    # `work` (N_ROWS, W) has their rows EAST to DOWN_Z (`pixel_rows`)
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     along_x, along_y, at, share = work[px.AT_X], work[px.AT_Y], cells[2], work[px.SHARE]
     for i in range(n):
@@ -133,11 +129,9 @@ def add_walls(surface, work, cells, n, weight, total):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _footprints(across, down, work, per_m, n):
-    """Fills the rows MAJOR_ALONG to SAMPLES, and LEVEL, of `work`: the filter of the pixels.
-
-    With J the (2, 2) displacement in the texture to the next pixels, the squared axes of the footprint are the
-    eigenvalues of J J^T. There are as many samples along the major axis as it is longer than the minor.
-    """
+    """Fills the rows MAJOR_ALONG to SAMPLES, and LEVEL, of `work`: the filter of the pixels."""
+    # the squared axes of the footprint are the eigenvalues of J J^T, J (2, 2) the displacement in the texture to the
+    # next pixels; there are as many samples along the major axis as it is longer than the minor
     zero, one, half, most = np.float32(0), np.float32(1), np.float32(0.5), np.float32(MOST_SAMPLES)
     for i in range(n):
         a, b, c, d = across[i] * per_m, work[px.ACROSS_Z, i] * per_m, down[i] * per_m, work[px.DOWN_Z, i] * per_m
