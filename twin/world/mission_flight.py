@@ -48,6 +48,10 @@ class PathChange(NamedTuple):
 _SAME_FACTOR = 0.01  # a factor of the pace that differs by less is set to the one that it approaches
 
 
+def _no_further_path(last: Reference, end: Point) -> tuple[Segment, ...]:
+    return ()  # a function, as a checkpoint cannot hold a lambda
+
+
 class Flight:
     """Flight of a mission through its world: all tracks, with station keeping after each of them.
 
@@ -65,7 +69,7 @@ class Flight:
         self.aligns = False
         self.n_skipped = 0  #: number of frames that `fast_forward` simulated in the last step
         #: path of one more track after the last reference and the end of the path, () for none
-        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = lambda last, end: ()
+        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = _no_further_path
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"fast_forward": None}
