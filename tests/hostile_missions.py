@@ -201,7 +201,7 @@ HOSTILE = {
     "half shiny floor": ("terrain.specular=0.4", "terrain.specular_width_deg=8"),
     # water and light
     "large flakes of snow": ("snow.density_per_m3=200", "snow.diameter_m=0.01"),
-    "one lamp beside the cameras": (
+    "one lamp next to the cameras": (
         "lamps=[{position_m=[0.0,0.12,-0.15],intensity_cd=1500}]",
         "water.turbidity=4",
     ),

@@ -23,6 +23,7 @@ from twin.estimate.vision.tiles import TiledRaster
 from twin.scenario.file import input_files, load_scenario
 from twin.session.conclusion import Estimation
 from twin.studies.results_log import cut_torn_line
+from twin.world.mission_flight import Flight
 
 SMALL = [
     "terrain.size_m=[5.0, 4.0]",
@@ -286,6 +287,11 @@ def test_a_study_refuses_an_input_file_that_has_changed_and_takes_new_ones(tmp_p
     texture.write_bytes(b"mud")
     with pytest.raises(TwinError, match="sand.png has changed since"):
         checkpoint.check_inputs(tmp_path, [dem, texture])
+
+
+def test_a_flight_can_be_stored():
+    """A lambda or an inner function in it would leave every survey without checkpoints."""
+    assert pickle.loads(pickle.dumps(Flight(None, None))).further_path(None, None) == ()
 
 
 def test_a_torn_last_line_of_a_journal_is_removed(tmp_path):

@@ -1,4 +1,4 @@
-"""Text files of other programs from Jinja templates beside the code that fills them."""
+"""Text files of other programs from Jinja templates next to the code that fills them."""
 
 from collections.abc import Mapping
 from importlib.resources import files

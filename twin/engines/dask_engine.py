@@ -112,7 +112,7 @@ def _run_task(function: Callable[[Task], Result], task: Task, limits: TaskLimits
 
 @contextmanager
 def _cancelled_without_workers(client: Client, running: dict[Any, tuple[Any, Future]]) -> Iterator[threading.Event]:
-    """Cancels the running tasks if all workers are lost for `_WITHOUT_WORKERS_S`; yields an event that says so."""
+    """Cancels the running tasks if all workers are lost for `_WITHOUT_WORKERS_S`; yields an event that is set then."""
     lost, ended = threading.Event(), threading.Event()
 
     def watch() -> None:
