@@ -512,6 +512,27 @@ def test_pairs_too_far_apart_for_tracking_are_linked_directly(tmp_path):
     assert found.metrics["trajectory"]["f2f"]["ate_max_m"] < 0.02  # the links continue it, and give it the velocity
 
 
+def test_an_object_that_moves_almost_as_the_floor_does_moves_neither_path_nor_its_sigma(tmp_path):
+    """A piece of floor of an eighth of the image, seen by both cameras, whose images move by 7/8 of the floor's."""
+    path = recorded.poses(60)
+    slower = path.copy()
+    slower[:, 0, 3] = path[0, 0, 3] + 0.875 * (path[:, 0, 3] - path[0, 0, 3])
+    slower[:, 1, 3] += 0.8
+    crossing = recorded.frames(path)
+    height, width, disparity_px = 64, 84, round(RIG.focal_px * RIG.baseline_m / 1.6)
+    for one, other, pose in zip(crossing, recorded.frames(slower), slower, strict=True):
+        travelled_px = RIG.focal_px * (pose[0, 3] - path[0, 0, 3]) / 1.6
+        start = round((120 - travelled_px) % (RIG.width_px + width)) - width
+        for shown, hidden, shift in ((one.left, other.left, 0), (one.right, other.right, disparity_px)):
+            columns = slice(max(start - shift, 0), max(start - shift + width, 0))
+            shown[50 : 50 + height, columns] = hidden[50 : 50 + height, columns]
+    folder = recorded.write_euroc(tmp_path / "set", crossing, path)
+    found = twin.replay(folder, tmp_path / "run", ReplayOptions(outputs=())).metrics
+    errors_m = [found["trajectory"][name]["ate_rmse_m"] for name in ("final", "online")]
+    assert found["status"] == "complete" and errors_m[0] < 1.05 * errors_m[1] < 0.004
+    assert found["consistency"]["nees_position_mean"] < 4 * 3  # sigmas at most twice too small
+
+
 def test_the_truth_is_sorted_and_of_equal_times_the_first_pose_counts():
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = [2, 0, 1, 9]

@@ -243,6 +243,7 @@ def test_an_error_of_all_lengths_is_part_of_the_covariances():
     np.testing.assert_allclose(added, error[:, :, None] * error[:, None, :], atol=1e-12)
     known = np.isfinite(elevation.sigma_m)
     np.testing.assert_allclose((higher.sigma_m**2 - elevation.sigma_m**2)[known], (share * 2.0) ** 2, rtol=1e-4)
+    assert higher.variances.calibration - elevation.variances.calibration == pytest.approx((share * 2.0) ** 2)
     assert with_length_error(result, elevation, [])[0] is result
 
 

@@ -375,6 +375,15 @@ class MapGrid:
         return self.west_m + across, self.north_m - down
 
 
+class HeightVariances(NamedTuple):
+    """Mean variances of the heights of a map by their causes [m^2], over its typical cells (`ElevationMap`)."""
+
+    stereo: float = 0.0  #: noise of the measured depths: noise, blur and contrast of the images
+    pose: float = 0.0  #: errors of the poses of the keyframes
+    relief: float = 0.0  #: slopes and steps, over which matching smooths and lateral errors change the height
+    calibration: float = 0.0  #: errors of the calibration, which are common to all keyframes
+
+
 @dataclass
 class ElevationMap:
     """Digital elevation model with its uncertainty, and an orthomosaic on the same grid."""
@@ -388,6 +397,13 @@ class ElevationMap:
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
     #: RMS of the differences of heights from two disjoint sets of keyframes / their standard deviation; None: unknown.
     scatter: float | None = None
+    variances: HeightVariances = HeightVariances()  #: mean of sigma_m squared over the typical cells, in parts
+
+    @property
+    def typical(self) -> NDArray[np.bool_]:
+        """Returns the mask (rows, cols) of the 95 % most certain cells: all but those at steep walls."""
+        known = np.isfinite(self.sigma_m)
+        return self.sigma_m <= (np.percentile(self.sigma_m[known], 95) if known.any() else 0.0)
 
     def to_world(self, points: Array) -> Array:
         return geometry.transform(geometry.inverse(self.map_from_world), points)

@@ -63,7 +63,9 @@ def with_length_error(
     cov[:, 3:, 3:] += of_positions**2 * offsets_m[:, :, None] * offsets_m[:, None, :]
     if elevation is not None:
         depth_m = np.float32(share * np.median(result.keyframe_depth_m))
-        elevation = replace(elevation, sigma_m=np.hypot(elevation.sigma_m, depth_m))
+        parts = elevation.variances
+        parts = parts._replace(calibration=parts.calibration + float(depth_m) ** 2)
+        elevation = replace(elevation, sigma_m=np.hypot(elevation.sigma_m, depth_m), variances=parts)
     return replace(result, node_cov=cov), elevation
 
 

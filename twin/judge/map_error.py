@@ -11,6 +11,7 @@ KEYS = (
     "cell_m", "completeness", "bias_m", "rmse_m", "nmad_m", "p85_m", "le90_m", "le95_m", "max_m", "sigma_ratio",
     "completeness_area", "le90_area_m", "median_m", "gross_share", "floor_median_m", "floor_le90_m",
     "floor_gross_share", "objects_median_m", "objects_le90_m", "objects_gross_share",
+    "typical_rmse_m", "stereo_error_m", "pose_error_m", "relief_error_m", "calibration_error_m",
 )  # fmt: skip
 GROSS_M = 0.1  #: absolute height error above which a cell counts as a gross error
 #: Metrics that are infinite, and therefore written as None, if the map has too many holes.
@@ -32,6 +33,9 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
     cell without an estimate (a hole) counts as an infinite error; an infinite percentile is None. median_m is the
     median of |e|, and gross_share the fraction of cells with |e| > 0.1 m. floor_* and objects_* are over the cells
     whose highest surface is the floor or an object; without objects, all cells are floor and objects_* are None.
+    typical_rmse_m is over the 95 % most certain cells; stereo_error_m, pose_error_m, relief_error_m and
+    calibration_error_m are the standard deviations of these cells by cause (`HeightVariances`), as the estimators state
+    them. The root of the sum of their squares corresponds to typical_rmse_m.
     """
     if elevation is None:
         return dict.fromkeys(KEYS)
@@ -57,6 +61,15 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
         "gross_share": mean(size > GROSS_M),
         **_of_surface("floor", size[~on_object]),
         **_of_surface("objects", size[on_object]),
+        "typical_rmse_m": rms(errors[estimated & elevation.typical]),
+        **errors_by_cause(elevation),
+    }
+
+
+def errors_by_cause(elevation: ElevationMap) -> dict[str, float | None]:
+    """Returns the stated standard deviations of the heights by their causes [m]."""
+    return {
+        f"{cause}_error_m": finite_float(variance**0.5) for cause, variance in elevation.variances._asdict().items()
     }
 
 

@@ -10,7 +10,7 @@ from twin.core.quality import ActionTimes, Energy, Gaps
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.judge.consistency import consistency_metrics
-from twin.judge.map_error import map_metrics
+from twin.judge.map_error import errors_by_cause, map_metrics
 from twin.judge.network_errors import NETWORK_KEYS, link_metrics, network_residuals, stage_metrics
 from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.judge.recorded import (
@@ -129,7 +129,7 @@ def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
 def _replay_sections(survey: EvaluationInput, truth: RecordedTruth) -> dict[str, Any]:
     result, elevation, empty, true = survey.result, survey.elevation, empty_metrics(), truth.trajectory
     errors = {} if true is None else {k: recorded_errors(p, true, truth.alignment) for k, p in _paths(result).items()}
-    heights = {"cell_m": None if elevation is None else elevation.grid.cell_m}
+    heights = {} if elevation is None else {"cell_m": elevation.grid.cell_m} | errors_by_cause(elevation)
     if elevation is not None and truth.heights_m is not None:
         heights = recorded_map_metrics(elevation, truth.heights_m)
     judged = {} if true is None else recorded_consistency(result, true, truth.alignment)

@@ -148,16 +148,17 @@ class MapModel:
             (sigmas.relief_m, noise.relief), (sigmas.edge_m, noise.edge), (sigmas.lateral_m, noise.lateral),
         ):  # fmt: skip
             error += sigma_m * normal.ravel()[index]
-        height, variance, systematic = np.full((3, *shape), np.nan, np.float32)
+        height, variance, systematic, pose = np.full((4, *shape), np.nan, np.float32)
         mapped_m = cell_view.mapped_heights(self._cells, self._cameras, index, observed.true, observed.estimated)
         height[i, k] = mapped_m + error
         variance[i, k] = typical_m**2
-        systematic[i, k] = self._pose_variances(observed.estimated, cov, index) + lateral_m**2
+        pose[i, k] = self._pose_variances(observed.estimated, cov, index)
+        systematic[i, k] = pose[i, k] + lateral_m**2
         if not np.isfinite(np.stack([values[i, k] for values in (height, variance, systematic)])).all():
             raise FloatingPointError("the error model gives a height or a variance that is not finite")
         pixel, mean_depth_m = np.zeros((*shape, 2), np.float32), float(observed.depth_m.mean())
         lateral = surface.LATERAL_SIGMA_PX * mean_depth_m / self._rig.focal_px
-        return HeightPatch(row, col, height, variance, systematic, pixel, lateral)
+        return HeightPatch(row, col, height, variance, systematic, pixel, lateral, pose_m2=pose)
 
     def _end_runs(self, observed: ObservedCells, following: ObservedCells | None) -> tuple[Index, CellConditions]:
         """Adds a keyframe to the runs of its cells; returns those that the next one does not see, with conditions."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
-from twin.core.records import ElevationMap, Image, Map, MapGrid, Mask
+from twin.core.records import ElevationMap, HeightVariances, Image, Map, MapGrid, Mask
 from twin.estimate.mapping.depth_filter import GATE
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.mapping.visibility import hidden, main_surface
@@ -43,7 +43,7 @@ class ElevationMapper:
         self.grid = grid
         self._height = np.full((2, *shape), np.nan, np.float32)
         self._variance = np.full((2, *shape), np.inf, np.float32)
-        self._systematic = np.zeros((2, *shape), np.float32)
+        self._systematic, self._pose = np.zeros((2, 2, *shape), np.float32)  # and its part due to the poses
         self._camera = np.full((2, *shape), -1, np.int32)  # index in `_cameras_m` of the last measurement
         self._cameras_m: list[Array] = []
         self._colour = np.zeros((*shape, 4), np.float32)
@@ -61,8 +61,9 @@ class ElevationMapper:
         camera = -1 if patch.camera_m is None else len(self._cameras_m)
         if patch.camera_m is not None:
             self._cameras_m.append(patch.camera_m)
-        layers = self._height, self._variance, self._systematic, self._camera
-        _fuse_cells(patch.row, patch.col, height, *patch[3:5], camera, GATE, *layers)
+        pose_m2 = patch.systematic_m2 if patch.pose_m2 is None else patch.pose_m2
+        layers = self._height, self._variance, self._systematic, self._pose, self._camera
+        _fuse_cells(patch.row, patch.col, height, *patch[3:5], pose_m2, camera, GATE, *layers)
 
     def add_colours(self, patch: HeightPatch, rgb: Image, gain: Map) -> None:
         """Adds an image, times its gain (H, W, 3), to the orthomosaic; weights decrease from the image centre."""
@@ -92,8 +93,8 @@ class ElevationMapper:
     def result(self) -> ElevationMap:
         self._drop_hidden()
         chosen, gap = self._choice(), self._height.max(axis=0) - self._height.min(axis=0)
-        height, variance, systematic = (
-            _taken(layers, chosen) for layers in (self._height, self._variance, self._systematic)
+        height, variance, systematic, pose = (
+            _taken(layers, chosen) for layers in (self._height, self._variance, self._systematic, self._pose)
         )
         height[_small_groups(np.isfinite(height))] = np.nan
         lateral_m = self._lateral_m[0] / max(self._lateral_m[1], 1)
@@ -106,7 +107,11 @@ class ElevationMapper:
         sigma = np.where(np.isnan(height), np.nan, sigma).astype(np.float32)
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
-        return ElevationMap(self.grid, height, sigma, np.clip(mosaic + 0.5, 0, 255).astype(np.uint8))
+        found = ElevationMap(self.grid, height, sigma, np.clip(mosaic + 0.5, 0, 255).astype(np.uint8))
+        if (typical := found.typical).any():
+            parts = variance, pose, systematic - pose + edge_m2 + choice_m2
+            found.variances = HeightVariances(*(float(part[typical].mean()) for part in parts))
+        return found
 
 
 def _taken(layers: NDArray[Any], which: NDArray[np.int64]) -> Any:
@@ -202,7 +207,7 @@ def _remove_propagated(
 
 @kernel
 def _fuse_cells(
-    row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
+    row, col, height, variance, systematic, pose, camera, gate, heights, variances, systematics, poses, cameras
 ):  # fmt: skip
     """Kalman update of the cells' heights and variances with those of new patches."""
     for i in range(height.shape[0]):
@@ -223,12 +228,13 @@ def _fuse_cells(
                 worse = 0 if variances[0, a, b] >= variances[1, a, b] else 1
                 if r < variances[worse, a, b]:
                     heights[worse, a, b], variances[worse, a, b], systematics[worse, a, b] = z, r, q
-                    cameras[worse, a, b] = camera
+                    poses[worse, a, b], cameras[worse, a, b] = pose[i, j], camera
                 continue
             p = variances[best, a, b]
             gain = p / (p + r)
             heights[best, a, b] += gain * (z - heights[best, a, b])
             systematics[best, a, b] += gain * (q - systematics[best, a, b])
+            poses[best, a, b] += gain * (pose[i, j] - poses[best, a, b])
             variances[best, a, b], cameras[best, a, b] = p * r / (p + r), camera
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import EXACT, CalibrationEstimate
-from twin.core.records import ElevationMap, Image, Map, MapGrid, Mask, StereoRig
+from twin.core.records import ElevationMap, HeightVariances, Image, Map, MapGrid, Mask, StereoRig
 from twin.core.threads import prefetched
 from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap
@@ -96,7 +96,10 @@ def with_calibration_sigma(
     depth_m = float(np.mean(poses[:, 2, 3])) - found.height_m.astype(np.float64)
     by_error = np.stack([-(depth_m**2) / rig.baseline_m, depth_m], axis=-1)
     variance = np.einsum("...i,ij,...j->...", by_error, calibration.cov, by_error)
-    return replace(found, sigma_m=np.sqrt(found.sigma_m**2 + variance).astype(found.sigma_m.dtype))
+    parts = found.variances
+    if (typical := found.typical).any():
+        parts = parts._replace(calibration=float(variance[typical].mean()))
+    return replace(found, sigma_m=np.sqrt(found.sigma_m**2 + variance).astype(found.sigma_m.dtype), variances=parts)
 
 
 def _measure_depth(view: MapView, yaw_rad: float, rig: StereoRig, pattern: Map) -> tuple[Image, Map, DepthMap]:
@@ -146,4 +149,6 @@ def with_scatter(elevation: ElevationMap, one: ElevationMap, other: ElevationMap
     if np.isfinite(ratio).sum() < MIN_COMMON:
         return elevation
     scatter = float(np.sqrt(np.nanmean(ratio.astype(np.float64) ** 2)))
-    return replace(elevation, sigma_m=elevation.sigma_m * np.float32(max(scatter, 1.0)), scatter=scatter)
+    factor = max(scatter, 1.0)
+    parts = HeightVariances(*(factor**2 * part for part in elevation.variances))
+    return replace(elevation, sigma_m=elevation.sigma_m * np.float32(factor), scatter=scatter, variances=parts)

@@ -28,6 +28,7 @@ class HeightPatch(NamedTuple):
     pixel: Map  #: (rows, cols, 2) position (u, v) of the cell centre in the image [px]
     lateral_m: float  #: standard deviation of the lateral error at the mean depth of the depth map [m]
     camera_m: Array | None = None  #: (3,) position of the camera in the frame of the map [m]; None if it is not known
+    pose_m2: Map | None = None  #: (rows, cols) part of `systematic_m2` due to the pose; None: all of it
 
 
 def rasterise(
@@ -47,15 +48,15 @@ def rasterise(
         return None
     row, col, rows, cols = window
     lateral = LATERAL_SIGMA_PX * float(np.nanmean(depth_map.depth_m)) / rig.focal_px
-    height, variance, systematic = np.full((3, rows, cols), np.nan, np.float32)
+    height, variance, systematic, pose = np.full((4, rows, cols), np.nan, np.float32)
     pixel = np.zeros((rows, cols, 2), np.float32)
-    patch = HeightPatch(row, col, height, variance, systematic, pixel, lateral, world_from_camera[:3, 3].copy())
+    patch = HeightPatch(row, col, height, variance, systematic, pixel, lateral, world_from_camera[:3, 3].copy(), pose)
     rotation = np.kron(np.eye(2), world_from_camera[:3, :3])
     view = _ViewGeometry(
         world_from_camera[:3, 3] - [grid.west_m, grid.north_m, 0], world_from_camera[:3, 2].copy(),
         rotation @ pose_cov @ rotation.T, grid.cell_m, rig.focal_px, JUMP_PX / (rig.focal_px * rig.baseline_m),
     )  # fmt: skip
-    _triangles(points, *depth_map, view, *patch[:6])
+    _triangles(points, *depth_map, view, *patch[:6], pose)
     return patch
 
 
@@ -105,9 +106,9 @@ def _spans_integer(points, v, u, k):
 
 
 @kernel
-def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
+def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel, pose):
     """Writes the triangles of a depth map, except those that `rasterise` omits, to the layers of a patch, in place."""
-    out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel)
+    out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel, pose)
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):
             # most squares of pixels contain no cell centre
@@ -118,7 +119,7 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
 
 @kernel
 def _triangle(
-    va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
+    va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel, pose
 ):
     """Writes the cells in the triangle of the pixels a, b, c (rows v, columns u); the greatest height is kept."""
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
@@ -152,8 +153,8 @@ def _triangle(
             height[p, q] = h
             depth_variance = (1 - s - t) * variance[va, ua] + s * variance[vb, ub] + t * variance[vc, uc]
             height_variance[p, q] = height_per_depth * height_per_depth * depth_variance
-            systematic[p, q] = pose_variance(px, py, pz, sx, sy, view.cov)
-            systematic[p, q] += (LATERAL_SIGMA_PX * z / view.focal_px) ** 2 * (sx * sx + sy * sy)
+            pose[p, q] = pose_variance(px, py, pz, sx, sy, view.cov)
+            systematic[p, q] = pose[p, q] + (LATERAL_SIGMA_PX * z / view.focal_px) ** 2 * (sx * sx + sy * sy)
             pixel[p, q, 0] = ua + s * (ub - ua) + t * (uc - ua)
             pixel[p, q, 1] = va + s * (vb - va) + t * (vc - va)
 
