@@ -76,7 +76,7 @@ def test_the_run_folder_is_that_of_a_survey(replayed):
     assert "frames of recorded stereo data" in page and "reference plane" not in page
     assert "moved by the alignment of the replay" in page and "no transform is fitted" not in page
     assert "points to the bow" not in page
-    assert recording.write_recording(replayed.folder).is_file()
+    assert recording.record_run(load_run(replayed.folder)).is_file()
 
 
 def test_a_still_sequence_stays_in_place(tmp_path):

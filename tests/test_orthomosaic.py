@@ -2,6 +2,8 @@
 answers."""
 
 import dataclasses
+import tracemalloc
+import weakref
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from rasterio.enums import ColorInterp
 from twin import terrains
 from twin.core import geometry
 from twin.core.georeference import Georeference
-from twin.core.ortho_tiles import OrthoTile, finer_grid, mean_colours, window
+from twin.core.ortho_tiles import OrthoTile, at_centres, finer_grid, mean_colours, window
 from twin.core.records import ElevationMap, MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.estimate.mapping import exposure_balance
@@ -300,6 +302,47 @@ def test_the_colour_of_a_cell_is_the_mean_of_its_known_pixels():
     rgba = np.zeros((2, 4, 4), np.uint8)
     rgba[0, 0], rgba[1, 1] = (10, 20, 30, 255), (20, 40, 50, 255)
     np.testing.assert_array_equal(mean_colours(OrthoTile(GRID, 0, 0, rgba), 2)[0], [[15, 30, 40], [0, 0, 0]])
+
+
+# memory
+
+
+def peak_bytes(work):
+    tracemalloc.start()
+    work()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+def test_the_mean_colours_of_a_tile_take_less_memory_than_the_tile():
+    rgba = np.random.default_rng(0).integers(0, 256, (1024, 1024, 4), np.uint8)
+    assert peak_bytes(lambda: mean_colours(OrthoTile(GRID, 0, 0, rgba), 4)) < rgba.nbytes
+
+
+def test_the_holes_of_a_terrain_are_found_at_the_pixels_of_a_tile_in_20_bytes_per_pixel():
+    floor = terrains.Terrain(np.zeros((5, 7), np.float32), 2.0, -6.0, -4.0, np.zeros((9, 9, 3), np.uint8), 1.0)
+    grid = MapGrid(-5.0, 5.0, 0.01, 1000, 1000)
+    assert peak_bytes(lambda: at_centres(floor.in_hole, grid)) < 20 * 1000 * 1000
+
+
+def test_cells_are_tested_in_parts_as_all_at_once():
+    grid = MapGrid(-1.0, 2.0, 0.01, 150, 7)
+    x, y = np.meshgrid(*grid.centres())
+    np.testing.assert_array_equal(at_centres(lambda x, y: x > y, grid), x > y)
+
+
+def test_the_sums_of_a_tile_are_released_before_it_is_written(monkeypatch):
+    held = []
+
+    def empty_layers(*arguments, made=estimate.empty_layers):
+        layers = made(*arguments)
+        held.append(weakref.ref(layers.colour))
+        return layers
+
+    monkeypatch.setattr(estimate, "empty_layers", empty_layers)
+    tiles = estimate.orthomosaic(views([image_of(p) for p in POSES]), flat(), RIG)
+    assert next(tiles).known.any() and held[0]() is None
 
 
 # restoration

@@ -1,6 +1,7 @@
 """Rerun recording: it has every entity on both timelines and stays small."""
 
 import time
+import weakref
 from dataclasses import replace
 
 import cv2
@@ -38,7 +39,7 @@ def folder(tmp_path_factory):
 
 def test_the_recording_holds_the_whole_survey_on_both_timelines(folder):
     start = time.perf_counter()
-    file = recording.write_recording(folder)
+    file = recording.record_run(load_run(folder))
     assert time.perf_counter() - start < 10
     assert file == folder / "run.rrd" and file.stat().st_size < 10_000_000
     entities = contents(file)
@@ -53,20 +54,34 @@ def test_the_recording_holds_the_whole_survey_on_both_timelines(folder):
     assert entities["/world/rig/left"][1] == 87 + 1  # images and the camera model
 
 
+def test_images_are_read_one_by_one(folder, monkeypatch):
+    """Hundreds of large images would else be in memory at once."""
+    read = []
+
+    def read_rgb(file, before=recording.read_rgb):
+        read.append(weakref.ref(image := before(file)))
+        assert sum(one() is not None for one in read) <= 2  # this one and the last one
+        return image
+
+    monkeypatch.setattr(recording, "read_rgb", read_rgb)
+    recording.record_run(load_run(folder))
+    assert len(read) > 100
+
+
 def test_an_unfinished_run_has_a_recording(tmp_path):
-    entities = contents(recording.write_recording(write_folder(tmp_path / "run", finished=False)))
+    entities = contents(recording.record_run(load_run(write_folder(tmp_path / "run", finished=False))))
     assert {"/world/path/truth", "/world/path/online", "/world/rig/left", "/summary"} <= set(entities)
     assert "/world/path/final" not in entities and "/mosaic" not in entities
 
 
 def test_a_run_without_results_has_a_recording(tmp_path):
     (tmp_path / "scenario.resolved.toml").write_text("")
-    assert "/summary" in contents(recording.write_recording(tmp_path))
+    assert "/summary" in contents(recording.record_run(load_run(tmp_path)))
 
 
 def test_a_folder_that_is_not_a_run_is_rejected(tmp_path):
     with pytest.raises(TwinError, match="is not a run folder"):
-        recording.write_recording(tmp_path)
+        recording.record_run(load_run(tmp_path))
     with pytest.raises(TwinError, match="is not a run folder"):
         recording.open_viewer(tmp_path)
 

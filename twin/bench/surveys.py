@@ -17,6 +17,7 @@ from twin.estimate.alignment import align
 from twin.estimate.pipeline import Navigator
 from twin.exchange import posegraph
 from twin.report import recording, survey_page
+from twin.report.run_folder import load_run
 from twin.scenario.file import load_scenario
 from twin.session.assembly import make_navigator, open_world
 from twin.world.mission import prepare
@@ -51,7 +52,7 @@ def _survey(scene: str, overrides: Sequence[str]) -> list[float]:
         views = [*poses, *(poses[run.keyframes.frames] @ mission.rig.left_from_right)]
         works: Sequence[Callable[[], object]] = (
             lambda: survey_page.write_report(folder),
-            lambda: recording.write_recording(folder),
+            lambda: recording.record_run(load_run(folder)),
             lambda: [plain.render(view) for view in views],
         )
         times = survey_ms, *map(processor_ms, works)

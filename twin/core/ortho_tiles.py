@@ -1,14 +1,16 @@
 """Grid and tiles of an orthomosaic, which is made, written and evaluated tile by tile so that memory is bounded."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from twin.core.records import Image, MapGrid
+from twin.core.records import Array, Image, MapGrid, Mask
 
 #: Side of a tile [px]. A tile in progress takes 24 bytes per pixel: with its margin, 114 MB.
 TILE_PX = 2048
+_ROWS = 64  # rows of a grid at whose centres a function is evaluated at once
 
 
 class OrthoTile(NamedTuple):
@@ -39,10 +41,20 @@ def tile_side_px(n: int) -> int:
 def mean_colours(tile: OrthoTile, n: int) -> Image:
     """Returns the mean colours (rows // n, cols // n, 3) of the known pixels of squares of n x n pixels, or black."""
     rows, cols = (size // n for size in tile.rgba.shape[:2])
-    squares = tile.rgba[: rows * n, : cols * n].reshape(rows, n, cols, n, 4).astype(np.float32)
-    known = (squares[..., 3:] > 0).sum(axis=(1, 3))
-    total = (squares[..., :3] * (squares[..., 3:] > 0)).sum(axis=(1, 3))
-    return (total / np.maximum(known, 1) + 0.5).astype(np.uint8)
+    squares, means = tile.rgba[: rows * n, : cols * n].reshape(rows, n, cols, n, 4), np.empty((rows, cols, 3), np.uint8)
+    for row in range(rows):  # one by one: a whole tile in float32 takes 67 MB
+        part = squares[row].astype(np.float32)
+        known = part[..., 3:] > 0
+        total = (part[..., :3] * known).sum(axis=(0, 2))
+        means[row] = total / np.maximum(known.sum(axis=(0, 2)), 1) + 0.5
+    return means
+
+
+def at_centres(test: Callable[[Array, Array], Mask], grid: MapGrid) -> Mask:
+    """Returns the mask (rows, cols) of the cells of a grid whose centres (x, y) [m] pass a test."""
+    # by some rows at a time: those of the terrain take 120 bytes per point
+    x, y = grid.centres()
+    return np.concatenate([test(*np.meshgrid(x, y[row : row + _ROWS])) for row in range(0, grid.rows, _ROWS)])
 
 
 def window(grid: MapGrid, row: int, col: int, rows: int, cols: int) -> MapGrid:

@@ -113,7 +113,7 @@ class FrameRecorder:
     def _write(self, index: int, left: Image, right: Image | None) -> None:
         for side, image in (("left", left), ("right", right)):
             if image is not None:
-                data = cv2.imencode(".png", image[..., ::-1], _PNG)[1]
+                data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _PNG)[1]
                 (self._folder / side / f"{index:06d}.png").write_bytes(data.tobytes())
 
 

@@ -46,10 +46,10 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
     draw_meshes(
         [DrawnMesh(with_colours(mesh.vertices, mesh.faces, colours), camera_from_mesh)], view, Target(depth, drawn)
     )
-    rows, cols = np.nonzero(np.isfinite(depth))
+    rows, cols = (np.flatnonzero(np.isfinite(depth).any(axis=axis)) // _FINER for axis in (1, 0))
     if not len(rows):
         return None
-    shown = np.s_[rows.min() // _FINER : rows.max() // _FINER + 1, cols.min() // _FINER : cols.max() // _FINER + 1]
+    shown = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
     picture = cv2.resize(drawn, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
     return np.asarray(picture[shown], np.uint8)
 

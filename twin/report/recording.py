@@ -39,12 +39,8 @@ class FrameTimes(NamedTuple):
     times_s: Array
 
 
-def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
-    """Writes run.rrd into a run folder and returns its path; arguments and errors are those of `load_run`."""
-    return record_run(load_run(folder, metrics))
-
-
 def record_run(run: Run) -> Path:
+    """Writes run.rrd into the folder of a run and returns its path."""
     file = run.folder / "run.rrd"
     rig = replayed_rig(run.scenario)
     if rig is None:  # no plug-in is loaded for it
@@ -65,7 +61,7 @@ def open_viewer(folder: Path) -> int:
     """Opens a run in the Rerun viewer and returns the viewer's exit status. Writes run.rrd first if it is missing."""
     file = Path(folder) / "run.rrd"
     if not file.is_file():
-        write_recording(Path(folder))
+        record_run(load_run(folder))
     return subprocess.run([*VIEWER, str(file)], check=False).returncode
 
 
@@ -179,10 +175,11 @@ def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None
 
 
 def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: FrameTimes) -> None:
-    images = [read_rgb(run.image_file(int(f), side)) for f in times.frames]
-    exists = np.array([image is not None for image in images], dtype=bool)
+    images = (read_rgb(run.image_file(int(f), side)) for f in times.frames)  # one by one: 500 large ones take 3 GB
+    encoded = [None if image is None else jpeg_bytes(image, IMAGE_SIDE_PX) for image in images]
+    exists = np.array([data is not None for data in encoded], dtype=bool)
     if exists.any():
-        data = [jpeg_bytes(image, IMAGE_SIDE_PX) for image in images if image is not None]
+        data = [data for data in encoded if data is not None]
         columns = rr.EncodedImage.columns(blob=data, media_type=["image/jpeg"] * len(data))
         shown = FrameTimes(times.frames[exists], times.times_s[exists])
         recording.send_columns(f"world/rig/{side}", time_columns(shown), columns)

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.ortho_tiles import mean_colours, window
+from twin.core.ortho_tiles import at_centres, mean_colours, window
 from twin.core.quality import ActionTimes, Finding, Gaps
 from twin.core.records import ElevationMap, SurveyResult, Truth
 from twin.judge.metrics import EvaluationInput
@@ -165,7 +165,7 @@ def make_orthomosaic(
             mosaic[row : row + len(colours), col : col + colours.shape[1]] = colours
             if truth.albedo is not None and truth.in_area is not None:
                 part = window(tile.grid, tile.row, tile.col, *tile.rgba.shape[:2])
-                judge.add(tile, truth.albedo(part), truth.in_area(*np.meshgrid(*part.centres())))
+                judge.add(tile, truth.albedo(part), at_centres(truth.in_area, part))
             with stopwatch("orthomosaic"):
                 if file is not None:
                     file.write(tile)

@@ -12,6 +12,7 @@ from twin.controllers.camera_surface import surface_above_floor
 from twin.controllers.thruster_monitor import ThrusterMonitor
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.ortho_tiles import at_centres
 from twin.core.records import Exposure, Frame, Image, MapGrid, Readings, StereoRig, Trajectory, Truth
 from twin.core.series import GrowingArray
 from twin.core.timing import StageTimer
@@ -174,13 +175,12 @@ class World(ABC):
         return lambda sequence, k: k
 
     def truth(self) -> Truth:
-        n, surface = len(self), self.true_surface()
-        cells, in_hole = np.meshgrid(*self.mission.grid.centres()), self.mission.terrain.in_hole
-        unknown = in_hole(*cells)
+        n, surface, cells, terrain = len(self), self.true_surface(), self.mission.grid, self.mission.terrain
+        unknown = at_centres(terrain.in_hole, cells)
 
         def albedo(grid: MapGrid) -> NDArray[np.float32]:
-            colours = without_objects(true_albedo(self.mission.terrain, grid), grid, surface.objects, self.mission.grid)
-            colours[in_hole(*np.meshgrid(*grid.centres()))] = np.nan
+            colours = without_objects(true_albedo(terrain, grid), grid, surface.objects, cells)
+            colours[at_centres(terrain.in_hole, grid)] = np.nan
             return colours
 
         parts = self._sequences
@@ -192,7 +192,7 @@ class World(ABC):
             track=np.repeat(np.array([part.track for part in parts], np.int64), lengths)[:n],
             height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
             seen=self.seen() & ~unknown,
-            asked=self.mission.asked(*cells),
+            asked=at_centres(self.mission.asked, cells),
             reference_yaw=np.concatenate([np.empty(0), *(np.asarray(part.reference.yaw) for part in parts)])[:n],
             albedo=albedo,
             in_area=self.mission.asked,

@@ -60,7 +60,9 @@ def orthomosaic(
             add_view(layers, rgb, saturated, views.world_from_camera[k], rig, heights_m)
             n_done += 1
             progress(n_done / n_all)
-        yield OrthoTile(grid, row, col, _rgba(layers)[_MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX])
+        rgba = _rgba(layers)
+        del layers  # before the tile is written and judged
+        yield OrthoTile(grid, row, col, rgba[_MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX])
 
 
 def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid:

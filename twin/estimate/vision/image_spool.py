@@ -18,7 +18,7 @@ from twin.estimate.vision import matching
 from twin.estimate.vision.disparity import Disparity
 
 _Grays = tuple[matching.Gray, matching.Gray]  # of the left and the right image
-_CACHE_BYTES = 384 * 2**20
+_CACHE_BYTES = 64 * 2**20
 
 
 def remove_disparities(folder: Path) -> None:
