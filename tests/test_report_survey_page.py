@@ -69,7 +69,7 @@ def test_the_report_contains_the_values_of_the_metrics(folder, report):
         assert f">{metrics['links'][direction]['count']}</td>" in page
     for stage in metrics["stages"].values():
         assert f">{number_formats.length(stage['ate_rmse_m'])}</td>" in page
-    sections = "plan_view path_errors stages tracks elevation error histogram mosaic samples network timing terms"
+    sections = "plan_view path_errors stages tracks elevation error mosaic samples network timing terms"
     sections += " answers survey_data coverage calibration residuals sections error_classes standards processing files"
     for section in sections.split():
         assert f'<section id="{section}">' in page, section

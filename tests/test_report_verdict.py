@@ -117,7 +117,7 @@ def test_the_report_starts_with_the_badge_and_the_sentences(folder, monkeypatch,
 
 
 FIGURES = (
-    "plan_view path_errors stereo_quality coverage mosaic elevation sections error histogram network".split()
+    "plan_view path_errors stereo_quality coverage mosaic elevation sections error network".split()
 )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ def draw_all(run: Run, coverage: KeyframeCoverage | None = None) -> dict[str, st
     functions = {
         "plan_view": plan_view, "path_errors": path_error_curves,
         "stereo_quality": stereo_quality_curves, "elevation": map_figures.elevation_maps,
-        "error": map_figures.error_maps, "tasks": map_figures.task_maps, "histogram": error_histogram,
+        "error": map_figures.error_maps, "tasks": map_figures.task_maps,
         "network": network_plot, "mosaic": map_figures.orthomosaic_map,
         "sections": map_figures.cross_sections, "coverage": lambda run: map_figures.coverage_map(run, coverage),
     }  # fmt: skip
@@ -104,25 +104,6 @@ def stereo_quality_curves(run: Run) -> Figure | None:
         axes.plot(times_s[too_few], values[too_few], ".", color=COLOURS["limit"], markersize=6)
         axes.set(ylabel=label, ylim=(0, 1.08 * np.nanmax(values) or None))
     figure.axes[-1].set_xlabel("time [s]")
-    return figure
-
-
-def error_histogram(run: Run) -> Figure | None:
-    """Returns a histogram of the absolute height error, with lines at the percentiles given in metrics.json."""
-    if "dem_error" not in run.rasters:
-        return None
-    size = np.abs(run.rasters["dem_error"].values)
-    size = size[np.isfinite(size)]
-    if len(size) == 0:
-        return None
-    figure, axes = one_panel(2.8)
-    top = max(float(np.percentile(size, 99.5)), 1e-6)
-    axes.hist(np.minimum(size, top), bins=80, range=(0, top), color=COLOURS["online"], histtype="stepfilled")
-    for key, label in (("p85_m", "85th percentile"), ("le90_m", "LE90"), ("le95_m", "LE95")):
-        if (value := (run.metrics or {}).get("map", {}).get(key)) is not None:
-            axes.axvline(value, color=COLOURS["limit"], linewidth=1)
-            axes.text(value, axes.get_ylim()[1], f" {label}", rotation=90, va="top", ha="right", fontsize=8)
-    axes.set(xlabel="absolute height error [m] (last bar: this or larger)", ylabel="cells", xlim=(0, top))
     return figure
 
 
