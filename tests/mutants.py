@@ -155,9 +155,7 @@ MUTANTS = [
         ("twin/session/survey_check.py", "MAX_OFF_COURSE * min(mission.plan.request.footprint_m)", "MAX_OFF_COURSE * max(mission.plan.request.footprint_m)", "session_survey_check"),
         ("twin/gym.py", "velocity = np.array([c * forward - s * left, s * forward + c * left, up])", "velocity = np.array([c * forward + s * left, s * forward - c * left, up])", "gym"),
         # report
-        ("twin/report/survey_figures.py", "values = [row[f\"{key}_ga_rmse_m\"] or 0.0 for row in tracks]", "values = [row[\"after_ga_rmse_m\"] or 0.0 for row in tracks]", "report_figures"),
         ("twin/report/number_formats.py", "f\"{1e3 * math.radians(value_deg):.2g} mrad\"", "f\"{math.radians(value_deg):.2g} mrad\"", "report_comparison report_figures"),
-        ("twin/report/number_formats.py", "if gain > 1 else f\"{ratio(1 / gain)} larger\"", "if gain > 1 else f\"{ratio(gain)} larger\"", "report_survey_page report_figures"),
         ("twin/report/headline.py", "'at least' if more_is_better(name) else 'at most'", "'at most' if more_is_better(name) else 'at least'", "report_verdict"),
         # data sets, surrogate's fit, studies, app, reproduction
         ("twin/recordings/recorded_aiding.py", "return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane", "return geometry.so3_exp(-axis * np.arctan2(sine, up[2])) @ over_plane", "datasets_aiding"),

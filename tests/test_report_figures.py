@@ -1,38 +1,19 @@
 """Figures and numbers of the pages: which bar is which, labels of logarithmic axes, units of limits."""
 
 import base64
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import matplotlib
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from twin.core.georeference import Georeference
-from twin.report import plotting, survey_figures
+from twin.report import plotting
 from twin.report.number_formats import DASH, angle, length, milliradians, percent, with_unit
-from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.report.style import FIGURE_STYLE
 from twin.studies.answers import rounded
-
-
-def test_bars_before_and_after_alignment_have_the_heights_and_colours_of_their_labels():
-    tracks = [
-        {"track": 1, "before_ga_rmse_m": 0.03, "after_ga_rmse_m": 0.01},
-        {"track": 2, "before_ga_rmse_m": 0.05, "after_ga_rmse_m": None},
-    ]
-    run: Any = SimpleNamespace(metrics={"tracks": tracks})
-    figure = survey_figures.track_bars(run)
-    assert figure is not None
-    before, after = figure.axes[0].containers
-    assert [(bar.get_height(), bar.get_x() < k) for k, bar in enumerate(before)] == [(0.03, True), (0.05, True)]
-    assert [bar.get_height() for bar in after] == [0.01, 0.0]
-    for bars, label, role in ((before, "before GA", "online"), (after, "after GA", "final")):
-        assert bars.get_label() == label
-        assert to_hex(bars[0].get_facecolor()) == COLOURS[role]
 
 
 @pytest.mark.parametrize("low", [0.0007, 0.03, 4.0])

@@ -14,11 +14,13 @@ import pytest
 import recorded_datasets as recorded
 import test_study_agreement as gate
 import test_study_tuning as tuning
-from judge_synthetic import write_folder
+from judge_synthetic import write_folder, write_tif
 from matplotlib.backends.backend_agg import RendererAgg
 from study_surveys import STUDY, fly, study_of
 
 import twin
+from twin.exchange.geotiff import read_raster
+from twin.products.pages import change_of, products_of
 from twin.recordings.replay import ReplayOptions
 from twin.report import run_comparison, survey_page
 from twin.reproduce.exhibit import PAGE_FILE, read_all, write_all
@@ -125,7 +127,23 @@ def reproduction(folder):
     return folder / PAGE_FILE
 
 
-KINDS = (survey, replay, compared, study, agreement, tuned, reproduction)
+def products(folder):
+    return products_of(write_folder(folder / "run")).write(folder / "products")
+
+
+def change(folder):
+    """Change between two surveys of the synthetic floor, of which a part grew by 6 cm before the second."""
+    rng = np.random.default_rng(2)
+    runs = [write_folder(folder / name) for name in ("first", "second")]
+    for name in ("dem", "dem_truth"):
+        raster = read_raster(runs[1] / f"{name}.tif")
+        raster.values[60:90, 100:140] += 0.06
+        raster.values[:] += rng.normal(0, 0.008, raster.values.shape) * (name == "dem")
+        write_tif(runs[1] / f"{name}.tif", raster.grid, raster.values[None])
+    return change_of(*runs, 0.2).write(folder / "change")
+
+
+KINDS = (survey, replay, compared, study, agreement, tuned, reproduction, products, change)
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,12 @@ def test_the_first_sentence_states_where_the_seek_key_passes(tmp_path):
     assert fails.low > passes.high
 
 
+def test_the_first_screen_answers_in_one_sentence_of_everyday_words(study, analysis):
+    text, share = sentences.answer(analysis), analysis.pass_probability
+    numbers = f"about {100 * share.value:.0f} (between {100 * share.low:.0f} and {100 * share.high:.0f})"
+    assert text.startswith(f"Of 100 such surveys, {numbers} are completed and keep ") and text.count(". ") == 0
+
+
 def test_the_pass_probability_includes_aborted_surveys(study, analysis):
     turbid = [turbidity > 25 for turbidity in analysis.rows["vary.water.turbidity"].to_pylist()]
     assert (analysis.status == "aborted").tolist() == turbid
@@ -225,7 +231,7 @@ def test_the_page_is_self_contained_and_begins_with_the_result(tmp_path):
     write_report(analysis, tmp_path / "study.html")
     page = (tmp_path / "study.html").read_text()
     assert "How &lt;turbid&gt; may it be?" in page
-    assert page.index("of surveys pass") < page.index("<img")
+    assert page.index("of surveys pass") < page.index(sentences.answer(analysis)) < page.index("<main>")
     titles = (
         "Pass probability by key",
         "Where the required fraction of surveys passes",

@@ -181,7 +181,7 @@ def stop_at(share, error):
 
 @pytest.mark.long
 def test_an_interrupted_survey_reports_its_reason_and_keeps_partial_results(tmp_path, monkeypatch):
-    monkeypatch.setattr("twin.report.survey_page.draw_all", lambda _: {})  # figures take longer than the flight
+    monkeypatch.setattr("twin.report.survey_page.draw_all", lambda *_: {})  # figures take longer than the flight
     stop = stop_at(0.5, KeyboardInterrupt())
     result = fly(tmp_path / "run", "plan.area_m=[0.3, 0.5]", progress=stop, report=True)
     assert (result.status, result.metrics["reason"]) == ("aborted", "interrupted")

@@ -32,7 +32,7 @@ FLAT = [*SMALL, "vehicle.dynamics=kinematic", "plan.area_m=[0.8, 0.5]"]
 def flown(settings, folder, outputs):
     """Flies a survey; its report has the tracks only, because all figures take longer than the flight."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twin.report.survey_page.draw_all", lambda _: {"tracks": "data:,"})
+        patch.setattr("twin.report.survey_page.draw_all", lambda *_: {"tracks": "data:,"})
         patch.setattr("twin.report.survey_page.surface_picture", lambda *_: None)
         return survey.run(load_scenario("reef", settings), folder, outputs=outputs)
 

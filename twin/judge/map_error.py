@@ -1,10 +1,11 @@
 """Height errors of the elevation map, over the cells that both cameras saw in a keyframe and over the asked area."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
-from twin.core.records import Array, ElevationMap, Truth
+from twin.core.records import Array, ElevationMap, HeightVariances, Truth
 from twin.judge.summary_statistics import finite_float, mean, percentile, rms
 
 KEYS = (
@@ -71,6 +72,14 @@ def errors_by_cause(elevation: ElevationMap) -> dict[str, float | None]:
     return {
         f"{cause}_error_m": finite_float(variance**0.5) for cause, variance in elevation.variances._asdict().items()
     }
+
+
+def cause_shares(heights: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Returns the stated error [m] by cause, the largest first, and its share of the sum of squares, of `map.*`."""
+    stated = ((cause, heights.get(f"{cause}_error_m")) for cause in HeightVariances._fields)
+    known = {cause: error_m for cause, error_m in stated if error_m}
+    variance = sum(error_m**2 for error_m in known.values())
+    return {cause: (known[cause], known[cause] ** 2 / variance) for cause in sorted(known, key=lambda k: -known[k])}
 
 
 def _of_surface(name: str, size: Array) -> dict[str, float | None]:

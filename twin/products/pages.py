@@ -18,9 +18,9 @@ from twin.products.registration import PARAMETERS, Heights
 from twin.products.surface import Layer, block_means, slope_deg
 from twin.products.survey_products import error_field_of_map, survey_products
 from twin.report.html import render_page, render_text
+from twin.report.map_figures import map_axes, scalar_map
 from twin.report.plotting import WIDTH_IN, drawn, extent_of, hillshade
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
-from twin.report.survey_figures import map_axes, scalar_map
 
 _CHANGED_M = 1e-3  # true change above which a cell counts as changed
 _LEAST_TRUE_CELLS = 10  # of a region of true change

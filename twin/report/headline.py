@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple
 from twin.judge.map_error import INFINITE_WITH_HOLES
 from twin.judge.verdict import more_is_better, nees_bounds
 from twin.report.html import render_text
-from twin.report.number_formats import DASH, length, percent, with_unit
+from twin.report.number_formats import DASH, percent, with_unit
 from twin.scenario.water_sources import WATER_SOURCES
 
 #: Level of a badge: green, amber or red. The name is also the badge's CSS class in page.css.
@@ -38,9 +38,14 @@ def badge(metrics: Mapping[str, Any] | None) -> Badge:
 
 
 def first_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Returns sentences on the limitations: reason of the status, missed requirements, warnings, idealisations."""
+    """Returns sentences on the limitations: problems, then idealisations."""
+    return [*problems(metrics), *metrics.get("idealisations", ())]
+
+
+def problems(metrics: Mapping[str, Any]) -> list[str]:
+    """Returns sentences on the reason of the status, missed requirements and warnings."""
     warnings = metrics.get("warnings") or list(filter(None, [metrics.get("warning")]))
-    return [*_status(metrics), *_missed(metrics), *warnings, *metrics.get("idealisations", ())]
+    return [*_status(metrics), *_missed(metrics), *warnings]
 
 
 def _status(metrics: Mapping[str, Any]) -> list[str]:
@@ -107,34 +112,6 @@ def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
 
 def conditions(scenario: Mapping[str, Any], visibility_m: float | None = None) -> str:
     """Returns the conditions of a survey as text: altitude, rig, water type with source of its table, clarity."""
-    water, plan = scenario.get("water", {}), scenario.get("plan", {})
-    jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
-    custom = water.get("absorption_per_m") or water.get("spectrum_file")
-    source = f" ({WATER_SOURCES[water['source']].citation})" if "source" in water else ""
-    kind = "water with custom optical properties" if custom else f"water of Jerlov type {jerlov}{source}"
-    if jerlov == "clear" and not custom:
-        kind, turbidity = "clear water", 1.0
-    scattering = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""
-    seen = f", visibility {visibility_m:.2g} m" if visibility_m else ""
-    rig = scenario.get("rig", {}).get("title")
-    cameras = f' with the rig "{rig}"' if rig else ""
-    below = "smoothed floor" if plan.get("height") == "floor" else "reference plane"
-    return f"{plan.get('altitude_m', 0):g} m above the {below}{cameras} in {kind}{scattering}{seen}"
-
-
-def closed_form_comparison(links: Mapping[str, Any]) -> str:
-    """Returns sentences that compare the translation errors of the links with those of the closed form, eq. (2)."""
-    changes = []
-    for direction in ("along", "across"):
-        error = links[direction]["translation_rmse_m"]
-        closed_form_error = links[direction]["closed_form_translation_rmse_m"]
-        if error and closed_form_error is not None:
-            changes.append(f"from {length(closed_form_error)} to {length(error)} {direction}")
-    if not any(links[direction]["count"] for direction in ("along", "across")):
-        return "No motion between keyframes was measured."
-    if not changes:
-        return "The motions between keyframes were not computed by eq. (2)."
-    return (
-        "Eq. (2) treats the depth of one stereo pair as exact. Two-view structure and motion weights both stereo pairs "
-        f"by their noise, which changes the RMS translation error of the links {' and '.join(changes)}."
-    )
+    source = scenario.get("water", {}).get("source")
+    known = {"scenario": scenario, "visibility_m": visibility_m, "source": WATER_SOURCES[source] if source else None}
+    return " ".join(render_text("conditions.txt.j2", known).split())

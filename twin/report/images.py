@@ -15,10 +15,17 @@ _SIGNATURES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
 
 def jpeg_bytes(image: Image, longest_px: int) -> bytes:
     """Returns an RGB image as JPEG data, downscaled to a longer side of `longest_px` if it is larger."""
-    if (scale := longest_px / max(image.shape[:2])) < 1:
-        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    image = reduced(image, longest_px)
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return data.tobytes()
+
+
+def reduced(image: Image, longest_px: int) -> Image:
+    """Returns an image downscaled to a longer side of `longest_px` if it is larger."""
+    scale = longest_px / max(image.shape[:2])
+    if scale >= 1:
+        return image
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def png_bytes(image: Image) -> bytes:

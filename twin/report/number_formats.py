@@ -47,13 +47,6 @@ def ratio(value: float | None) -> str:
     return DASH if value is None else f"{value:.1f} ×" if value < 9.95 else f"{value:.0f} ×"  # noqa: RUF001
 
 
-def improvement(gain: float | None) -> str:
-    """Returns the change of an error, e.g. "2.0 × smaller", from before / after; "" for 0.95 to 1.05 and None."""
-    if gain is None or 0.95 <= gain <= 1.05:
-        return ""
-    return f"{ratio(gain)} smaller" if gain > 1 else f"{ratio(1 / gain)} larger"
-
-
 def milliseconds(value_ms: float | None) -> str:
     """Returns a duration as text, in ms if shorter than one second, otherwise in s; a dash for None."""
     return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"

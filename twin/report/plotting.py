@@ -16,18 +16,19 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 
 from twin.core.georeference import Georeference
 from twin.core.records import MapGrid
-from twin.report.images import png_bytes
+from twin.report.images import jpeg_bytes, png_bytes
 from twin.report.style import FIGURE_STYLE
 
 WIDTH_IN = 9.6
+PHOTOS = ("mosaic",)  #: figures that are written as JPEG
 PAD_IN = 0.08  #: white margin around a figure
 
 
 def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> dict[str, str]:
-    """Returns the PNG data URI of each figure that a function of `data` draws, by name of the figure."""
+    """Returns the data URI of each figure that a function of `data` draws, by name of the figure."""
     with matplotlib.rc_context(FIGURE_STYLE):
         figures = {name: draw(*data) for name, draw in functions.items()}
-        return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
+        return {name: to_data_uri(figure, name in PHOTOS) for name, figure in figures.items() if figure is not None}
 
 
 @contextmanager
@@ -40,8 +41,11 @@ def png_figure(file: Path, width_in: float, height_in: float, grid: bool = True)
         figure.savefig(file, format="png")
 
 
-def to_data_uri(figure: Figure) -> str:
-    """Returns a figure without its white margins as PNG data URI; matplotlib's own `tight` would draw it twice."""
+def to_data_uri(figure: Figure, photo: bool = False) -> str:
+    """Returns a figure without its white margins as data URI, PNG or, of a photo, JPEG.
+
+    matplotlib's own `tight` would draw it twice.
+    """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]
@@ -49,7 +53,8 @@ def to_data_uri(figure: Figure) -> str:
     rows, cols = (np.flatnonzero(inked.any(axis=axis)) for axis in (1, 0))
     pad = round(PAD_IN * figure.dpi)
     kept = tuple(slice(max(0, at[0] - pad), at[-1] + pad + 1) for at in (rows, cols)) if len(rows) else ()
-    return "data:image/png;base64," + base64.b64encode(png_bytes(pixels[kept])).decode()
+    data = jpeg_bytes(pixels[kept], max(pixels.shape)) if photo else png_bytes(pixels[kept])
+    return f"data:image/{'jpeg' if photo else 'png'};base64," + base64.b64encode(data).decode()
 
 
 def one_panel(height_in: float) -> tuple[Figure, Axes]:

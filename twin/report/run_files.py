@@ -31,6 +31,8 @@ _INDEX = {
     "timing_ms": {_ANY: [0.0]},
     "stereo_observations": [{name: _NAN for name in OBSERVATION_KEYS}],
     "map_from_world": [[0.0]],
+    "asked_m2": None,
+    "asked_area_m": [[[0.0]]],
 }
 
 
@@ -59,6 +61,8 @@ def checked_index(index: Any) -> dict[str, Any]:
         raise ValueError("tracks: must have one number per frame")
     if "map_from_world" in index and [len(row) for row in index["map_from_world"]] != [4] * 4:
         raise ValueError("map_from_world: must have 4 rows of 4 numbers")
+    if any(len(corner) != 2 for ring in index.get("asked_area_m", []) for corner in ring):
+        raise ValueError("asked_area_m: must be rings of corners with 2 numbers")
     return index
 
 

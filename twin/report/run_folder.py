@@ -39,6 +39,8 @@ class Keyframes(NamedTuple):
     #: including those that gave no keyframe.
     stereo_observations: Array
     map_from_world: Array  # (4, 4) pose of the world in the frame of the maps (`ElevationMap.map_from_world`)
+    asked_m2: float | None = None  # size of the asked area; None: not known
+    asked_area_m: tuple[Array, ...] = ()  # rings (n, 2) around the asked area and its holes, in the map [m]
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,11 @@ def _read_keyframes(file: Path) -> Keyframes:
     rows = [[observation[key] for key in OBSERVATION_KEYS] for observation in index.get("stereo_observations", [])]
     stereo_observations = np.array(rows, float).reshape(-1, 3)
     map_from_world = np.array(index.get("map_from_world", np.eye(4)), float)
-    return Keyframes(frames, tracks, index.get("n_frames_per_keyframe"), timing_ms, stereo_observations, map_from_world)
+    rings = tuple(np.array(ring, float).reshape(-1, 2) for ring in index.get("asked_area_m", []))
+    return Keyframes(
+        frames, tracks, index.get("n_frames_per_keyframe"), timing_ms, stereo_observations, map_from_world,
+        index.get("asked_m2"), rings,
+    )  # fmt: skip
 
 
 def _read_json(file: Path, checked: Callable[[Any], dict[str, Any]]) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import cv2
 import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
@@ -212,6 +213,10 @@ class RunFolder:
         }
         if record.elevation is not None:
             index["map_from_world"] = record.elevation.map_from_world.tolist()
+        if record.simulated is not None:
+            asked, grid = record.simulated.truth.asked, record.simulated.grid
+            index["asked_m2"] = float(asked.sum()) * grid.cell_m**2
+            index["asked_area_m"] = [ring.tolist() for ring in rings_around(asked, grid)]
         (self.path / "keyframes").mkdir(exist_ok=True)
         self._write("keyframes/index.json", json.dumps(index))
 
@@ -262,6 +267,17 @@ def _write_optional_output(name: str, run: "Run") -> None:
 
 def _error_m(elevation: ElevationMap, truth: Truth) -> NDArray[np.float32]:
     return np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
+
+
+def rings_around(cells: NDArray[np.bool_], grid: MapGrid) -> list[Array]:
+    """Returns closed rings (n, 2), x and y [m], around the cells (rows, cols) and around holes in them.
+
+    They pass through the centres of the outermost cells.
+    """
+    found, _ = cv2.findContours(cells.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    corners = [cv2.approxPolyDP(contour, 1.0, True)[:, 0] for contour in found if len(contour) > 2]
+    first = np.array([grid.west_m, grid.north_m]) + np.array([0.5, -0.5]) * grid.cell_m
+    return [first + np.array([1, -1]) * grid.cell_m * np.vstack([ring, ring[:1]]) for ring in corners]
 
 
 @cache

@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.user_files import read_text
-from twin.report.headline import REPLAY_ALIGNMENTS, badge, closed_form_comparison, first_lines, headline, key_figures
-from twin.report.html import render_page
+from twin.judge.map_error import cause_shares
+from twin.judge.standards import asprs_vertical_class_cm, iho_orders
+from twin.report.headline import REPLAY_ALIGNMENTS, badge, conditions, headline, key_figures, problems
+from twin.report.html import render_page, render_text
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.input_rows import input_rows
+from twin.report.keyframe_coverage import keyframe_coverage
 from twin.report.mesh_picture import surface_picture
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.stage_tables import PROCESSING_STAGES, stage_rows, stage_times
 from twin.report.style import COLOURS, ESTIMATES, LABELS
+from twin.report.survey_data import SurveyData, asked_area, errors_by_class, survey_data
 from twin.report.survey_figures import draw_all
 
 #: Longest side of an image in the report [px].
@@ -44,22 +48,33 @@ def render(run: Run) -> str:
 def context(run: Run) -> dict[str, Any]:
     """Returns the variables of the HTML template, survey_page.html.j2."""
     metrics = run.metrics or {}
-    has_links = "links" in metrics and not metrics.get("replay")
+    heights, depth_m = metrics.get("map") or {}, run.scenario.get("sun", {}).get("depth_m", 0.0)
+    check_points = sum(int(np.isfinite(layer.values).sum()) for key, layer in run.rasters.items() if key == "dem_error")
+    coverage = keyframe_coverage(run)
+    data = survey_data(run, coverage)
     return {
         "name": metrics.get("name") or run.scenario.get("name") or run.folder.name,
         "badge": badge(run.metrics),
-        "first_lines": first_lines(metrics) if metrics else [],
-        "headline": headline(run.metrics, run.scenario),
+        "problems": problems(metrics) if metrics else [],
+        "conditions": conditions(run.scenario, (metrics.get("water") or {}).get("visibility_m")),
+        "data": data,
+        "asked": asked_area(run),
+        "run": run,
+        "causes": cause_shares(heights),
+        "errors_by_class": errors_by_class(run, coverage),
+        "orders": iho_orders(depth_m, heights.get("le95_m")),
+        "check_points": check_points,
+        "vertical_class_cm": asprs_vertical_class_cm(heights.get("rmse_m"), check_points),
+        "files": {file.name for file in run.folder.iterdir()},
+        "headline": answer(run, data),
         "metrics": metrics,
         "input": input_rows(metrics.get("input") or {}),
         "key_figures": key_figures(metrics),
         "estimates": [(key, LABELS[key], (metrics.get("trajectory") or {}).get(key)) for key in ESTIMATES],
         "stages": [(row, LABELS[row.stage]) for row in stage_rows(metrics, run.scenario)],
-        "closed_form_comparison": closed_form_comparison(metrics["links"]) if has_links else "",
         "stage_times": stage_times(metrics, run.scenario, run.keyframes.n_frames_per_keyframe) if metrics else [],
         "processing_stages": PROCESSING_STAGES,
-        "figures": draw_all(run),
-        "mosaic": mosaic_image(run),
+        "figures": draw_all(run, coverage),
         "surface": jpeg_uri(surface_picture(run.folder / "mesh.glb", run.keyframes.map_from_world)),
         "samples": sample_images(run),
         "alignment": REPLAY_ALIGNMENTS[run.alignment or "first"],
@@ -69,12 +84,12 @@ def context(run: Run) -> dict[str, Any]:
     }
 
 
-def mosaic_image(run: Run) -> str | None:
-    """Returns the orthomosaic as a JPEG data URI, white where it has no data; None if the run has no mosaic."""
-    if "mosaic" not in run.rasters:
-        return None
-    mosaic = run.rasters["mosaic"].values
-    return jpeg_uri(np.where(mosaic.any(axis=2, keepdims=True), mosaic, np.uint8(255)))
+def answer(run: Run, data: SurveyData | None) -> str:
+    """Returns what a survey reached, in words; of a replay or unfinished survey its headline."""
+    if not run.metrics or run.metrics.get("replay"):
+        return headline(run.metrics, run.scenario)
+    known = {"metrics": run.metrics, "data": data, "asked": asked_area(run)}
+    return " ".join(render_text("survey_answer.txt.j2", known).split())
 
 
 def sample_images(run: Run) -> list[tuple[int, str, str]]:

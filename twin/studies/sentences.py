@@ -80,6 +80,24 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
+def answer(analysis: StudyAnalysis) -> str:
+    """Returns what a study found in one sentence without terms of statistics; "" without an evaluated survey."""
+    if not analysis.evaluated.any():
+        return ""
+    share, required = analysis.pass_probability, analysis.required_probability
+    of_100 = f"about {100 * share.value:.0f} (between {100 * share.low:.0f} and {100 * share.high:.0f})"
+    wanted = f", where {100 * required:g} are required" if required is not None else ""
+    kept = " and ".join(_limits(analysis))
+    return f"Of 100 such surveys, {of_100} are completed{f' and keep {kept}' if kept else ''}{wanted}."
+
+
+def _limits(analysis: StudyAnalysis) -> list[str]:
+    return [
+        f"{metric_name(metric)} {'at least' if more_is_better(metric) else 'at most'} {metric_value(metric, limit)}"
+        for metric, limit in analysis.limits.items()
+    ]
+
+
 def headline(analysis: StudyAnalysis) -> str:
     """Returns the main results of a study as text; without an evaluated survey, only which surveys are not counted."""
     n, study = int(analysis.evaluated.sum()), analysis.study
@@ -88,10 +106,7 @@ def headline(analysis: StudyAnalysis) -> str:
         left_out.append(f"The study is not finished: {counted(n_left, 'survey')} not flown yet; --resume continues it.")
     if n == 0:
         return " ".join(["No survey could be evaluated.", *left_out])
-    limits = [
-        f"{metric_name(metric)} {'at least' if more_is_better(metric) else 'at most'} {metric_value(metric, limit)}"
-        for metric, limit in analysis.limits.items()
-    ]
+    limits = _limits(analysis)
     completed = "were completed" + (" with " + " and ".join(limits) if limits else "")
     result = (
         f"The pass probability is {confidence(analysis.pass_probability)}: "
