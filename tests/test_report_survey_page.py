@@ -91,9 +91,7 @@ def test_the_report_names_the_causes_of_the_height_error(folder):
     causes = {"stereo_error_m": 0.004, "pose_error_m": 0.003, "relief_error_m": None, "calibration_error_m": 0.0}
     metrics["map"] |= causes | {"typical_rmse_m": 0.0052}
     page = write_report(folder, metrics).read_text()
-    assert (
-        "64 % is noise of the stereo matching (contrast, blur and noise of the images), 36 % is errors" in page
-    )
+    assert "64 % is noise of the stereo matching (contrast, blur and noise of the images), 36 % is errors" in page
     assert "Together they state an error of 5.0 mm" in page and "the true one is 5.2 mm" in page
     assert "fly lower, overlap more, a longer baseline" in page
 

@@ -14,6 +14,11 @@ KEYS = (
     "floor_gross_share", "objects_median_m", "objects_le90_m", "objects_gross_share",
     "typical_rmse_m", "stereo_error_m", "pose_error_m", "relief_error_m", "calibration_error_m",
 )  # fmt: skip
+#: Causes of errors of heights in words, by their names in `HeightVariances`.
+CAUSES = {
+    "stereo": "noise of the stereo matching", "pose": "errors of the camera poses", "relief": "slopes and steps",
+    "calibration": "errors of the calibration",
+}  # fmt: skip
 GROSS_M = 0.1  #: absolute height error above which a cell counts as a gross error
 #: Metrics that are infinite, and therefore written as None, if the map has too many holes.
 INFINITE_WITH_HOLES = ("map.le90_area_m",)

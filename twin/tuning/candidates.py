@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import ScenarioError, TwinError
-from twin.judge.map_error import INFINITE_WITH_HOLES, with_completeness
+from twin.judge.map_error import CAUSES, INFINITE_WITH_HOLES, with_completeness
 from twin.judge.verdict import meets_limit, more_is_better
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
@@ -55,6 +55,7 @@ class SurveyScore(NamedTuple):
     scenario_hash: str
     reason: str  #: why the survey did not pass; empty if it did
     unmodelled: bool  #: whether only the surrogate refuses it
+    causes: dict[str, float | None]  #: `map.*_error_m` by cause, without `map.`
 
 
 class Candidate(NamedTuple):
@@ -193,6 +194,7 @@ class CandidateSurveys:
             row["scenario_hash"],
             failure_reason(row),
             bool(row.get("unmodelled")),
+            {f"{cause}_error_m": row.get(f"map.{cause}_error_m") for cause in CAUSES},
         )
 
     def _samples(self, number: int, values: Values) -> Iterator[Sample]:

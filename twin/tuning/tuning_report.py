@@ -87,6 +87,8 @@ def headline(result: TuningResult) -> str:
         f"{medians}; by the surrogate, pass probability with new seeds "
         f"{sentences.confidence(chosen.pass_probability)}. {count}. In the scenario, {_values(chosen)}."
     )
+    if verification.limited_by:
+        text += f" What limits its heights (of their stated variance): {verification.limited_by}."
     if failed:
         text += f" The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}."
     return text + (" The budget was used up before cheaper plans were tried." if result.out_of_time else "")

@@ -2,10 +2,14 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
+from twin.judge.map_error import CAUSES, cause_shares
+from twin.judge.summary_statistics import rms
 from twin.report.number_formats import percent
 from twin.studies.analysis import count_similar
 from twin.studies.statistics import Proportion, exact_interval, trials_to_show
-from twin.tuning.candidates import Candidate, CandidateSurveys, median_of, required_probability
+from twin.tuning.candidates import Candidate, CandidateSurveys, SurveyScore, median_of, required_probability
 from twin.tuning.correction import PlanRatio, metric_ratio
 
 _FIRST_SURVEYS = 3  # flown before it is looked at how many failed; then as many again
@@ -25,6 +29,7 @@ class Verification(NamedTuple):
     search_round: int  #: round of the search, from 0
     warnings: dict[str, int]  #: for each warning, the number of rendered surveys that have it
     reasons: dict[str, int]  #: for each reason, the number of rendered surveys that did not pass
+    limited_by: str = ""  #: causes of the stated height errors of rendered surveys, with their shares; "": not known
 
     @property
     def probability(self) -> Proportion:
@@ -101,4 +106,11 @@ def verification_of(
         search_round,
         rendered.warnings([surrogate]),
         count_similar(score.reason for score in scores if not score.passed),
+        _limits(scores),
     )
+
+
+def _limits(scores: list[SurveyScore]) -> str:
+    names = scores[0].causes if scores else ()
+    stated = {name: rms(np.array([score.causes.get(name) or 0.0 for score in scores])) for name in names}
+    return ", ".join(f"{CAUSES[cause]} ({percent(share)})" for cause, (_, share) in cause_shares(stated).items())
