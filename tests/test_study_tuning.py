@@ -101,7 +101,7 @@ def test_the_recommended_scenario_reads_back_with_the_chosen_values(searched):
     page = (folder / "tuning.html").read_text()
     flown = r"Fly 1\.9\d m above the reference plane at 0\.35 m/s, legs [\d.]+ c?m apart \([\d.]+ min, one dive\): "
     assert re.search(flown, page)
-    assert page.index("In the scenario, plan.altitude_m = 1.9") < page.index("<img")
+    assert page.index("In the scenario: plan.altitude_m = 1.9") < page.index("<img")
     assert (folder / "pareto.png").stat().st_size > 5000
 
 

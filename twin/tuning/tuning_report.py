@@ -82,16 +82,16 @@ def headline(result: TuningResult) -> str:
         for name, (surrogate, rendered) in verification.medians.items()
         if rendered is not None
     )
-    text = (
-        f"{result.instructions}: {verification.counts()}; {verification.state()}. Medians rendered (surrogate): "
-        f"{medians}; by the surrogate, pass probability with new seeds "
-        f"{sentences.confidence(chosen.pass_probability)}. {count}. In the scenario, {_values(chosen)}."
-    )
-    if verification.limited_by:
-        text += f" What limits its heights (of their stated variance): {verification.limited_by}."
-    if failed:
-        text += f" The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}."
-    return text + (" The budget was used up before cheaper plans were tried." if result.out_of_time else "")
+    lines = [
+        f"{result.instructions}: {verification.counts()}; {verification.state()}.",
+        f"Medians rendered (surrogate): {medians}.",
+        verification.limited_by and f"What limits its heights (of their stated variance): {verification.limited_by}.",
+        f"{count}; by the surrogate, pass probability with new seeds {sentences.confidence(chosen.pass_probability)}.",
+        f"In the scenario: {_values(chosen)}.",
+        failed and f"The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}.",
+        result.out_of_time and "The budget was used up before cheaper plans were tried.",
+    ]
+    return "\n".join(filter(None, lines))
 
 
 def _values(plan: Candidate) -> str:
@@ -222,7 +222,7 @@ def plan_toml(result: TuningResult) -> str:
     if result.scenario is None:
         return ""
     imaging = result.scenario.imaging.model_copy(update={"fidelity": "rendered"})
-    comments = [f"twin tune of {result.study.name}", headline(result)]
+    comments = [f"twin tune of {result.study.name}", *headline(result).splitlines()]
     comments += [f"Warning: {text}" for text in warnings(result)]
     scenario = result.scenario.model_copy(update={"imaging": imaging})
     return "".join(f"# {' '.join(line.split())}\n" for line in comments) + dump_toml(scenario)
