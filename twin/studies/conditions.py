@@ -28,16 +28,19 @@ def in_sea_trial(study: Study) -> Study:
 def condition_lines(study: Study) -> list[str]:
     """Returns sentences on the rig, on what its scenario idealises, and on the sea trial, for the pages of results."""
     tree, flown = read_tree(study.scenario_file), study
-    sea = "The surveys are not in the conditions of a sea trial."
+    sea, search = "The surveys are not in the conditions of a sea trial.", ""
     if study.sea_trial or (study.sea_trial is None and study.tune is not None):
         which = "All surveys" if study.sea_trial else "The rendered surveys that verify a plan"
-        flown = in_sea_trial(study)
-        keys = [key for part in _preset().values() for key, _ in flat_keys(part)]
-        sea = f"{which} are in the conditions of a sea trial: {', '.join(keys)}."
+        search = "" if study.sea_trial else "In the search, which a fast model flies: "
+        flown, (fixed, varied) = in_sea_trial(study) if study.sea_trial else study, _missing(study)
+        keys = [f"{key} = {value}" for key, value in fixed.items()]
+        keys += [f"{key} = {law.values[0]} to {law.values[-1]}" for key, law in varied.items()]
+        sea = f"{which} are in the conditions of a sea trial: {', '.join(keys) or 'as the study sets them'}."
     for sample in samples(flown):
         with suppress(ScenarioError):
             scenario = scenario_of_sample(flown, tree, sample)
-            return [f"Rig: {scenario.rig.title or 'the cameras of the scenario'}.", *idealisations(scenario), sea]
+            rig = f"Rig: {scenario.rig.title or 'the cameras of the scenario'}."
+            return [rig, search + " ".join(idealisations(scenario)), sea]
     return [sea]
 
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from twin.core.user_files import read_text
+from twin.judge.verdict import more_is_better
 from twin.report.html import render_page
 from twin.report.number_formats import percent, plain
 from twin.report.plotting import log_axis, to_data_uri
@@ -73,7 +74,8 @@ def headline(result: TuningResult) -> str:
     """Returns the main result: the recommended plan with its medians and pass probability, or why there is none."""
     count = f"{len(result.candidates)} plans were evaluated"
     if n_rendered := len(result.verifications):
-        count += f", {n_rendered} of them also in rendered surveys"
+        start = " and the starting plan" if result.start else ""
+        count += f", {n_rendered} of them{start} also in rendered surveys"
     chosen, failed = result.recommended, result.failed_cheaper
     if (verification := result.verification(chosen)) is None or chosen is None:
         return f"No plan is recommended: {_missing_plan(result, count)}"
@@ -84,14 +86,24 @@ def headline(result: TuningResult) -> str:
     )
     lines = [
         f"{result.instructions}: {verification.counts()}; {verification.state()}.",
-        f"Medians rendered (surrogate): {medians}.",
-        verification.limited_by and f"What limits its heights (of their stated variance): {verification.limited_by}.",
+        f"Medians of these surveys (in brackets, of the fast surrogate model): {medians}.",
+        verification.limited_by and f"What limits its heights: {verification.limited_by} of their stated variance.",
+        f"A survey passes if it is complete with {_limits(result)}. Beyond the conditions of this study (varied: "
+        f"{', '.join(result.study.vary) or 'none'}), on other floors and in other waters, the plan may fail.",
         f"{count}; by the surrogate, pass probability with new seeds {sentences.confidence(chosen.pass_probability)}.",
         f"In the scenario: {_values(chosen)}.",
         failed and f"The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}.",
         result.out_of_time and "The budget was used up before cheaper plans were tried.",
     ]
     return "\n".join(filter(None, lines))
+
+
+def _limits(result: TuningResult) -> str:
+    limits = [
+        f"{metric_name(name)} {'at least' if more_is_better(name) else 'at most'} {metric_value(name, limit)}"
+        for name, limit in result.study.limits.items()
+    ]
+    return ", ".join(limits) or "the requirements of its scenario met"
 
 
 def _values(plan: Candidate) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from twin.judge.map_error import CAUSES, cause_shares
 from twin.judge.summary_statistics import rms
-from twin.report.number_formats import percent
+from twin.report.number_formats import length, percent
 from twin.studies.analysis import count_similar
 from twin.studies.statistics import Proportion, exact_interval, trials_to_show
 from twin.tuning.candidates import Candidate, CandidateSurveys, SurveyScore, median_of, required_probability
@@ -113,4 +113,6 @@ def verification_of(
 def _limits(scores: list[SurveyScore]) -> str:
     names = scores[0].causes if scores else ()
     stated = {name: rms(np.array([score.causes.get(name) or 0.0 for score in scores])) for name in names}
-    return ", ".join(f"{CAUSES[cause]} ({percent(share)})" for cause, (_, share) in cause_shares(stated).items())
+    return ", ".join(
+        f"{CAUSES[cause]} {length(m)} ({percent(share)})" for cause, (m, share) in cause_shares(stated).items()
+    )
