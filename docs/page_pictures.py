@@ -48,6 +48,7 @@ def main(folder: Path) -> None:
                     [chromium, *FLAGS, *options, (folder / page).resolve().as_uri()], check=True, capture_output=True
                 )
                 image = cv2.imread(str(shot))
+                assert image is not None
             cv2.imwrite(str(target / f"{name}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
