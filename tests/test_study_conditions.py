@@ -60,5 +60,5 @@ def test_pages_name_rig_idealisations_and_sea_trial(tmp_path, line, sentence):
     assert lines[0] == "Rig: machine-vision pair, dome ports."
     ideal = [text for text in lines if "no marine snow" in text]
     assert len(ideal) == (line != "sea_trial = true\n")
-    assert all(text.startswith("In the search, which a fast model flies: ") == (line == SEARCH) for text in ideal)
+    assert all(text.startswith("In the search: ") == (line == SEARCH) for text in ideal)
     assert sentence in lines[-1] and ("snow.density_per_m3 = 0.0 to 200.0" in lines[-1]) == bool(line)

@@ -14,7 +14,7 @@ _CELLS = 250
 
 
 class KeyframeCoverage(NamedTuple):
-    """KeyframeCoverage of every n-th row and column of a map by stereo pairs, without occlusions."""
+    """Coverage of every n-th row and column of a map by stereo pairs, without occlusions."""
 
     grid: MapGrid  # cells that are n times as large as those of the map
     step: int  # n

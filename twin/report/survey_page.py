@@ -49,7 +49,8 @@ def context(run: Run) -> dict[str, Any]:
     """Returns the variables of the HTML template, survey_page.html.j2."""
     metrics = run.metrics or {}
     heights, depth_m = metrics.get("map") or {}, run.scenario.get("sun", {}).get("depth_m", 0.0)
-    check_points = sum(int(np.isfinite(layer.values).sum()) for key, layer in run.rasters.items() if key == "dem_error")
+    error = run.rasters.get("dem_error")
+    check_points = 0 if error is None else int(np.isfinite(error.values).sum())
     coverage = keyframe_coverage(run)
     data = survey_data(run, coverage)
     return {

@@ -31,7 +31,7 @@ def condition_lines(study: Study) -> list[str]:
     sea, search = "The surveys are not in the conditions of a sea trial.", ""
     if study.sea_trial or (study.sea_trial is None and study.tune is not None):
         which = "All surveys" if study.sea_trial else "The rendered surveys that verify a plan"
-        search = "" if study.sea_trial else "In the search, which a fast model flies: "
+        search = "" if study.sea_trial else "In the search: "
         flown, (fixed, varied) = in_sea_trial(study) if study.sea_trial else study, _missing(study)
         keys = [f"{key} = {value}" for key, value in fixed.items()]
         keys += [f"{key} = {law.values[0]} to {law.values[-1]}" for key, law in varied.items()]
@@ -40,7 +40,8 @@ def condition_lines(study: Study) -> list[str]:
         with suppress(ScenarioError):
             scenario = scenario_of_sample(flown, tree, sample)
             rig = f"Rig: {scenario.rig.title or 'the cameras of the scenario'}."
-            return [rig, search + " ".join(idealisations(scenario)), sea]
+            ideal = " ".join(idealisations(scenario))
+            return [rig, *([search + ideal] if ideal else []), sea]
     return [sea]
 
 

@@ -1,6 +1,6 @@
 """Text of the study report: metrics, confidence intervals, and the sentences that summarise the results."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,14 +87,14 @@ def answer(analysis: StudyAnalysis) -> str:
     share, required = analysis.pass_probability, analysis.required_probability
     of_100 = f"about {100 * share.value:.0f} (between {100 * share.low:.0f} and {100 * share.high:.0f})"
     wanted = f", where {100 * required:g} are required" if required is not None else ""
-    kept = " and ".join(_limits(analysis))
+    kept = " and ".join(limits_in_words(analysis.limits))
     return f"Of 100 such surveys, {of_100} are completed{f' and keep {kept}' if kept else ''}{wanted}."
 
 
-def _limits(analysis: StudyAnalysis) -> list[str]:
+def limits_in_words(limits: Mapping[str, float]) -> list[str]:
     return [
         f"{metric_name(metric)} {'at least' if more_is_better(metric) else 'at most'} {metric_value(metric, limit)}"
-        for metric, limit in analysis.limits.items()
+        for metric, limit in limits.items()
     ]
 
 
@@ -106,7 +106,7 @@ def headline(analysis: StudyAnalysis) -> str:
         left_out.append(f"The study is not finished: {counted(n_left, 'survey')} not flown yet; --resume continues it.")
     if n == 0:
         return " ".join(["No survey could be evaluated.", *left_out])
-    limits = _limits(analysis)
+    limits = limits_in_words(analysis.limits)
     completed = "were completed" + (" with " + " and ".join(limits) if limits else "")
     result = (
         f"The pass probability is {confidence(analysis.pass_probability)}: "

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from twin.core.user_files import read_text
-from twin.judge.verdict import more_is_better
 from twin.report.html import render_page
 from twin.report.number_formats import percent, plain
 from twin.report.plotting import log_axis, to_data_uri
@@ -84,11 +83,12 @@ def headline(result: TuningResult) -> str:
         for name, (surrogate, rendered) in verification.medians.items()
         if rendered is not None
     )
+    limits = ", ".join(sentences.limits_in_words(result.study.limits)) or "the requirements of its scenario met"
     lines = [
         f"{result.instructions}: {verification.counts()}; {verification.state()}.",
         f"Medians of these surveys (in brackets, of the fast surrogate model): {medians}.",
         verification.limited_by and f"What limits its heights: {verification.limited_by} of their stated variance.",
-        f"A survey passes if it is complete with {_limits(result)}. Beyond the conditions of this study (varied: "
+        f"A survey passes if it is complete with {limits}. Beyond the conditions of this study (varied: "
         f"{', '.join(result.study.vary) or 'none'}), on other floors and in other waters, the plan may fail.",
         f"{count}; by the surrogate, pass probability with new seeds {sentences.confidence(chosen.pass_probability)}.",
         f"In the scenario: {_values(chosen)}.",
@@ -96,14 +96,6 @@ def headline(result: TuningResult) -> str:
         result.out_of_time and "The budget was used up before cheaper plans were tried.",
     ]
     return "\n".join(filter(None, lines))
-
-
-def _limits(result: TuningResult) -> str:
-    limits = [
-        f"{metric_name(name)} {'at least' if more_is_better(name) else 'at most'} {metric_value(name, limit)}"
-        for name, limit in result.study.limits.items()
-    ]
-    return ", ".join(limits) or "the requirements of its scenario met"
 
 
 def _values(plan: Candidate) -> str:
