@@ -231,7 +231,7 @@ def test_cells_on_both_sides_of_a_step_of_the_floor_are_kept():
     np.testing.assert_allclose(map_with(steps), steps, atol=1e-6)
 
 
-def test_sigma_of_cells_next_to_a_step_includes_the_height_of_the_other_side():
+def test_sigma_of_cells_within_three_cells_of_a_step_includes_its_smoothing():
     mapper, step_m = elevation.ElevationMapper(GRID), 0.4
     patches = []
     for height, columns in ((step_m, np.s_[:80]), (0.0, np.s_[80:])):
@@ -240,10 +240,24 @@ def test_sigma_of_cells_next_to_a_step_includes_the_height_of_the_other_side():
         patches.append(surface.rasterise(depth_map(depth, 1e-8), down_camera(0, 0, 2.0), EXACT, RIG, GRID))
         mapper.fuse(patches[-1])
     sigma, across_m = mapper.result().sigma_m[:, 100], np.abs(Y[:, 100])
-    share = np.mean([patch.lateral_m for patch in patches]) / (2 * GRID.cell_m)
-    near, away = across_m < 0.02, (across_m > 0.06) & (across_m < 0.3)
-    np.testing.assert_allclose(sigma[near], np.hypot(np.sqrt(share), share) * step_m, rtol=1e-3)
+    lateral_cells = np.mean([patch.lateral_m for patch in patches]) / GRID.cell_m
+    near, away = across_m < 3 * GRID.cell_m, (across_m > 4 * GRID.cell_m) & (across_m < 0.3)
+    # the heights 0, 0 and h of 3 x 3 cells have the RMS distance h / sqrt(18) from their plane
+    np.testing.assert_allclose(sigma[near], 5 * lateral_cells * step_m / np.sqrt(18), rtol=1e-3)
     np.testing.assert_allclose(sigma[away], 1e-4, rtol=1e-2)
+
+
+def test_roughness_is_the_rms_distance_from_the_least_squares_plane():
+    z = np.random.default_rng(3).normal(0, 0.1, (7, 8)) - 20
+    z[0, 0] = np.nan
+    y, x = np.mgrid[-1:2, -1:2]
+    design = np.stack([np.ones(9), x.ravel(), y.ravel()], axis=1)
+    found = elevation._roughness(z.astype(np.float32))
+    assert found[1, 1] == 0  # a cell of the block is not known
+    for row, col in ((2, 3), (5, 6), (3, 1)):
+        block = z[row - 1 : row + 2, col - 1 : col + 2].ravel()
+        rest = block - design @ np.linalg.lstsq(design, block, rcond=None)[0]
+        assert found[row, col] == pytest.approx(np.sqrt(np.mean(rest**2)), rel=1e-4)
 
 
 def test_the_gain_removes_the_pattern_of_a_lamp_on_the_vehicle():

@@ -16,6 +16,10 @@ from twin.kernels import kernel
 #: The higher of two hypotheses is chosen if the depth variance of the lower one is more than this many times larger.
 _VARIANCE_RATIO = 10.0
 _WRONG_CHOICE = 0.16  # measured probability that the chosen hypothesis of a cell with two hypotheses is wrong
+#: Height error / (roughness * lateral error in cells) where the matching window smooths steps and ridges; measured in
+#: 12 surveys, over two reefs and corals on a floor, with four rigs. A smoothed step is a ramp: its errors are up to
+#: half its height, but its heights differ little from cell to cell.
+_SMOOTHING = 5.0
 _NEIGHBOURS_AT_CORNER = 3  # of a cell at a right-angled corner of a step, on its own side (at a straight step: 5)
 MIN_CELLS = 12
 _NEIGHBOURS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2))  # rows and columns in 3 x 3 cells
@@ -33,9 +37,9 @@ class ElevationMapper:
     are dropped (`visibility`), and cells that contradict all neighbours have no result.
 
     The depth variance is independent between patches; the variance of pose and smoothing is common to them, so it is
-    averaged. The result adds, with f the standard deviation of the lateral error per two cells, f^2 times the squared
-    range of heights around the cell, f times the squared step across it if larger than a cell, and the variance of the
-    choice between hypotheses.
+    averaged. The result adds the variance of the choice between hypotheses, and that of steps and ridges, which the
+    matching window smooths: the square of `_SMOOTHING` times the standard deviation of the lateral error, in cells,
+    times the largest roughness within two cells.
     """
 
     def __init__(self, grid: MapGrid):
@@ -100,8 +104,8 @@ class ElevationMapper:
         lateral_m = self._lateral_m[0] / max(self._lateral_m[1], 1)
         fraction = lateral_m / (2 * self.grid.cell_m)
         height[_contradicted(height, variance + systematic + self.grid.cell_m**2, fraction)] = np.nan
-        step = _step(height)
-        edge_m2 = (fraction * _relief(height)) ** 2 + fraction * np.where(step > self.grid.cell_m, step, 0) ** 2
+        roughness_m = cv2.dilate(_roughness(height), np.ones((5, 5), np.uint8))
+        edge_m2 = (_SMOOTHING * lateral_m / self.grid.cell_m * roughness_m) ** 2
         choice_m2 = _WRONG_CHOICE * (1 - _WRONG_CHOICE) * np.nan_to_num(gap) ** 2
         sigma = np.sqrt(variance + systematic + edge_m2 + choice_m2)
         sigma = np.where(np.isnan(height), np.nan, sigma).astype(np.float32)
@@ -170,23 +174,14 @@ def _trimmed_range(heights: Map) -> Map:
     return np.where(known >= 6, highest - ordered[:, 2], np.float32(0))
 
 
-def _relief(height: Map) -> Map:
-    block = np.ones((3, 3), np.uint8)
-    far = np.float32(1e6)
-    high = cv2.dilate(np.where(np.isnan(height), -far, height), block)
-    return np.maximum(high - cv2.erode(np.where(np.isnan(height), far, height), block), 0)
-
-
-def _step(height: Map) -> Map:
-    """Returns the largest absolute second difference (rows, cols) of height in four directions [m]; 0: unknown."""
-    step = np.zeros_like(height)
-    if min(height.shape) < 3:
-        return step
-    inner, around = height[1:-1, 1:-1], np.lib.stride_tricks.sliding_window_view(height, (3, 3))
-    for i, j in ((0, 1), (1, 0), (0, 0), (0, 2)):
-        second_difference = np.abs(around[..., i, j] + around[..., 2 - i, 2 - j] - 2 * inner)
-        np.fmax(step[1:-1, 1:-1], second_difference, out=step[1:-1, 1:-1])
-    return step
+def _roughness(height: Map) -> Map:
+    """Returns the RMS distance (rows, cols) of the heights of 3 x 3 cells from their plane [m]; 0 with unknown ones."""
+    known = np.isfinite(height)
+    z, one, across = np.where(known, height, 0).astype(np.float64), np.ones(3), np.array([-1.0, 0, 1])
+    mean, right, up = (cv2.sepFilter2D(z, -1, *weights) for weights in ((one / 9, one), (across, one), (one, across)))
+    square = cv2.sepFilter2D(z**2, -1, one / 9, one) - mean**2 - (right**2 + up**2) / 54
+    complete = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    return np.where(complete, np.sqrt(np.maximum(square, 0)), 0)
 
 
 @kernel
