@@ -1,5 +1,7 @@
 """Estimators as a library, independent of the simulator; see docs/estimators.md."""
 
+from typing import TYPE_CHECKING, Any
+
 from twin.core.records import (
     ElevationMap,
     Estimate,
@@ -12,7 +14,9 @@ from twin.core.records import (
     Trajectory,
 )
 from twin.core.settings import EstimatorSettings
-from twin.estimate.pipeline import Navigator
+
+if TYPE_CHECKING:
+    from twin.estimate.pipeline import Navigator
 
 __all__ = [
     "ElevationMap",
@@ -27,3 +31,12 @@ __all__ = [
     "SurveyResult",
     "Trajectory",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Returns `Navigator`, whose compiled functions take long to load, when it is asked for."""
+    if name == "Navigator":
+        from twin.estimate.pipeline import Navigator
+
+        return Navigator
+    raise AttributeError(f"module 'twin.estimate' has no attribute {name!r}")
