@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core import geometry
+from twin.core.image_coverage import image_coverage
 from twin.core.records import Array, MapGrid, StereoRig
 from twin.report.run_folder import Run
 
@@ -34,34 +34,8 @@ def keyframe_coverage(run: Run) -> KeyframeCoverage | None:
     heights = dem.values[::step, ::step].astype(float)
     heights = np.where(np.isfinite(heights), heights, np.nanmedian(heights))
     x, y = (centres[::step] for centres in dem.grid.centres())
-    points = np.stack([*np.meshgrid(x, y), heights], axis=-1)
-    counts, total_m = np.zeros(heights.shape, np.int64), np.zeros(heights.shape)
-    for pose in run.keyframes.map_from_world @ poses[run.keyframes.frames[run.keyframes.frames < len(poses)]]:
-        rows, cols = _window(rig, pose, x, y, heights.min())
-        cells = points[rows, cols]
-        shown = _shown(rig, geometry.transform(geometry.inverse(pose), cells.reshape(-1, 3))).reshape(cells.shape[:2])
-        counts[rows, cols] += shown
-        total_m[rows, cols] += np.where(shown, pose[2, 3] - cells[..., 2], 0.0)
-    range_m = np.divide(total_m, counts, out=np.full(counts.shape, np.nan), where=counts > 0)
+    points = np.stack([*np.meshgrid(x, y), heights], axis=-1).reshape(-1, 3)
+    keyframes = run.keyframes.map_from_world @ poses[run.keyframes.frames[run.keyframes.frames < len(poses)]]
+    found = image_coverage(points, keyframes, rig, rig.baseline_m)
     grid = MapGrid(dem.grid.west_m, dem.grid.north_m, step * dem.grid.cell_m, *heights.shape)
-    return KeyframeCoverage(grid, step, counts, range_m)
-
-
-def _window(rig: StereoRig, pose: Array, x: Array, y: Array, lowest_m: float) -> tuple[slice, slice]:
-    """Returns the rows (y descending) and columns (x ascending) of the cells that an image can show."""
-    corners = np.array([(u, v) for u in (-0.5, rig.width_px - 0.5) for v in (-0.5, rig.height_px - 0.5)])
-    rays = np.column_stack([rig.normalised(corners), np.ones(4)]) @ pose[:3, :3].T
-    if (rays[:, 2] >= 0).any():  # the horizon is in the image
-        return slice(None), slice(None)
-    # all rays end between the camera and the plane of the lowest cell
-    ends = pose[:2, 3] + rays[:, :2] * ((lowest_m - pose[2, 3]) / rays[:, 2:])
-    (west, south), (east, north) = (side(np.vstack([ends, pose[:2, 3]]), axis=0) for side in (np.min, np.max))
-    cols = slice(int(np.searchsorted(x, west)), int(np.searchsorted(x, east, "right")))
-    return slice(int(np.searchsorted(-y, -north)), int(np.searchsorted(-y, -south, "right"))), cols
-
-
-def _shown(rig: StereoRig, points: Array) -> NDArray[np.bool_]:
-    """Returns whether both images show points (n, 3) in the axes of the left camera [m]."""
-    u, v = rig.project(points).T
-    right = u - rig.focal_px * rig.baseline_m / points[:, 2]
-    return (points[:, 2] > 0) & (u <= rig.width_px - 0.5) & (right >= -0.5) & (v >= -0.5) & (v <= rig.height_px - 0.5)
+    return KeyframeCoverage(grid, step, found.count.reshape(heights.shape), found.height_m.reshape(heights.shape))
