@@ -26,7 +26,7 @@ def test_the_coverage_is_that_of_projections_into_both_images(baseline_m):
         shown[k] = inside[0] & inside[1] & (in_camera[:, 2] > 0)
     found = image_coverage(points, poses, RIG, baseline_m)
     assert shown.any(axis=0).sum() > 50
-    np.testing.assert_array_equal(found.count, shown.sum(axis=0))
+    np.testing.assert_array_equal(found.n_images, shown.sum(axis=0))
     np.testing.assert_array_equal(found.first, np.where(shown.any(axis=0), shown.argmax(axis=0), NOT_SHOWN))
     above = np.where(shown, poses[:, 2, 3, None] - points[:, 2], np.nan)
     some = shown.any(axis=0)

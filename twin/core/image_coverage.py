@@ -15,7 +15,7 @@ NOT_SHOWN = -1  #: `ImageCoverage.first` of a point that no image shows
 class ImageCoverage(NamedTuple):
     """Coverage of n points by images."""
 
-    count: NDArray[np.int64]  #: (n,) number of images that show the point
+    n_images: NDArray[np.int64]  #: (n,) number of images that show the point
     first: NDArray[np.int64]  #: (n,) index of the first of these images; `NOT_SHOWN` without one
     height_m: Array  #: (n,) mean height of these images above the point; NaN without one
 

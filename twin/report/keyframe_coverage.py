@@ -38,4 +38,4 @@ def keyframe_coverage(run: Run) -> KeyframeCoverage | None:
     keyframes = run.keyframes.map_from_world @ poses[run.keyframes.frames[run.keyframes.frames < len(poses)]]
     found = image_coverage(points, keyframes, rig, rig.baseline_m)
     grid = MapGrid(dem.grid.west_m, dem.grid.north_m, step * dem.grid.cell_m, *heights.shape)
-    return KeyframeCoverage(grid, step, found.count.reshape(heights.shape), found.height_m.reshape(heights.shape))
+    return KeyframeCoverage(grid, step, found.n_images.reshape(heights.shape), found.height_m.reshape(heights.shape))
