@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.height_field import map_slopes, raster_triangles
+from twin.core.image_coverage import NOT_SHOWN, image_coverage
 from twin.core.records import Array, Image, MapGrid, StereoRig
 from twin.report.run_folder import Raster
 
@@ -81,20 +82,9 @@ def _surface(raster: Raster, colours: Image) -> Surface:
 
 def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> NDArray[np.int64]:
     """Returns the first group of poses (n_k, 4, 4) that views each world point (n, 3); `NOT_OBSERVED` if none does."""
-    group = np.full(len(points), NOT_OBSERVED)
-    remaining = np.flatnonzero(np.isfinite(points).all(axis=1))
-    for number, poses in enumerate(groups):
-        for pose in poses:
-            inside = _in_image(points[remaining], pose, rig)
-            group[remaining[inside]] = number
-            remaining = remaining[~inside]
-    return group
-
-
-def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArray[np.bool_]:
-    x, y, z = geometry.transform(geometry.inverse(world_from_camera), points).T
-    tangent_x, tangent_y = rig.width_px / 2 / rig.focal_px, rig.height_px / 2 / rig.focal_px
-    return (z > 0) & (np.abs(x) <= tangent_x * z) & (np.abs(y) <= tangent_y * z)
+    first = image_coverage(points, np.concatenate(groups), rig, baseline_m=0.0).first
+    ends = np.cumsum([len(poses) for poses in groups])
+    return np.where(first == NOT_SHOWN, NOT_OBSERVED, np.searchsorted(ends, first, "right"))
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
