@@ -15,6 +15,7 @@ from twin.core.records import Alignment, ElevationMap, MapGrid, StereoRig, Surve
 from twin.core.timing import Stopwatch
 from twin.judge.map_error import height_error
 from twin.judge.metrics import EvaluationInput, evaluate
+from twin.report.run_writer import link_residuals, position_cov_m2
 from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
 
@@ -177,6 +178,7 @@ def _write_keyframes(folder: Path, result: SurveyResult, rig: StereoRig) -> None
         "tracks": result.track_of_keyframe.tolist(),
         "n_frames_per_keyframe": 8,
     }
+    index |= {"position_cov_m2": position_cov_m2(result).tolist(), "link_residuals": link_residuals(result).tolist()}
     index["timing_ms"] = {"f2f": [12.0] * len(result.online), "stereo": [35.0] * len(result.keyframe_rows)}
     (folder / "index.json").write_text(json.dumps(index))
     ground = cv2.GaussianBlur(rng.normal(0, 1, (600, 900)), (0, 0), 1.5)

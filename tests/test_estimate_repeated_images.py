@@ -127,5 +127,6 @@ def test_a_survey_whose_camera_freezes_holds_and_ends_with_that_reason(tmp_path,
     first = next(event for event in events if event.get("status") == LEFT_REPEATS)
     assert result.status == "aborted" and reason.endswith(LEFT_REPEATS) and "water" not in reason
     assert first["time_s"] < 2.1 and [e["action"] for e in events if e["event"] == "action"] == ["hold"]
+    assert [event["reason"] for event in events if event["event"] == "flight ended early"] == [reason]
     assert any(text.startswith(LEFT_REPEATS.capitalize()) for text in result.metrics["warnings"])
     assert result.metrics["control"]["cross_track_rmse_m"] < 0.1

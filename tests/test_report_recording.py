@@ -1,13 +1,16 @@
 """Rerun recording: it has every entity on both timelines and stays small."""
 
+import json
 import time
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import rerun as rr
+import rerun.blueprint as rrb
 from judge_synthetic import SCENARIO, survey, write_folder
 from rerun.chunk import RrdReader
 
@@ -18,6 +21,7 @@ from twin.exchange import geotiff
 from twin.report import recording, recording_surfaces
 from twin.report.images import jpeg_bytes
 from twin.report.run_folder import Raster, load_run, read_mosaic
+from twin.report.run_writer import link_residuals, position_cov_m2
 
 PATHS = {f"/world/path/{name}" for name in ("truth", "reference", "f2f", "online", "final")}
 ERRORS = {f"/error/{what}/{name}" for what in ("position", "height", "heading") for name in ("f2f", "online", "final")}
@@ -30,6 +34,15 @@ def contents(file) -> dict[str, tuple[set[str], int]]:
         lines, rows = entities.get(str(chunk.entity_path), (set(), 0))
         entities[str(chunk.entity_path)] = (lines | set(chunk.timeline_names), rows + chunk.num_rows)
     return entities
+
+
+def rows(file, entity: str) -> list[dict]:
+    """Returns the rows of an entity of a recording: frame and components, in the order of time."""
+    batches = [c.to_record_batch() for c in RrdReader(str(file)).stream() if str(c.entity_path) == entity]
+    found = [row for batch in batches for row in batch.to_pylist() if "frame" in row]
+    return sorted(
+        ({key.split(":")[-1]: value for key, value in row.items()} for row in found), key=lambda r: r["frame"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -45,9 +58,10 @@ def test_the_recording_holds_the_whole_survey_on_both_timelines(folder):
     entities = contents(file)
     expected = PATHS | ERRORS | {"/world", "/world/true_floor", "/world/network", "/world/rig", "/mosaic", "/summary"}
     expected |= {"/world/rig/left", "/world/rig/right", "/timing/f2f", "/timing/stereo", "/timing/ga"}
+    expected |= {f"/attitude/{angle}/{name}" for angle in ("roll", "pitch", "heading") for name in ("truth", "final")}
     assert expected <= set(entities)
     assert sum(entity.startswith("/world/map/") for entity in entities) > 10
-    static = {"/world", "/world/true_floor", "/world/path/reference", "/mosaic", "/summary"}
+    static = {"/world", "/world/true_floor", "/world/path/reference", "/summary"}
     for entity in expected - static:
         assert {"frame", "sim_time"} <= entities[entity][0], entity
     assert entities["/world/rig"][1] == 720
@@ -218,3 +232,167 @@ def test_a_map_of_one_row_or_column_has_a_surface_without_triangles(shape):
     """The last shape has one row after subsampling."""
     surface = recording_surfaces.floor_surface(Raster(MapGrid(0, 0, 0.1, *shape), np.zeros(shape)))
     assert len(surface.triangles) == 0 and (surface.normals == [0, 0, 1]).all()
+
+
+def test_the_map_grows_and_the_orthomosaic_appears_at_the_end(folder):
+    run = load_run(folder)
+    file = recording.record_run(run)
+    assert [row["frame"] for row in rows(file, "/mosaic")] == [len(run.times_s) - 1]
+    first = [rows(file, entity)[0]["frame"] for entity in contents(file) if entity.startswith("/world/map/")]
+    assert min(first) == 0 and len(set(first)) == len(first) > 10
+
+
+def random_rotations(n: int, seed: int) -> np.ndarray:
+    return np.array([geometry.so3_exp(w) for w in np.random.default_rng(seed).normal(0, 2, (n, 3))])
+
+
+def test_ellipsoids_are_two_sigma_along_the_principal_axes():
+    """Covariances with known standard deviations 1, 2 and 5 mm along known axes."""
+    rotations = random_rotations(20, 0)
+    cov = rotations @ np.diag([4e-6, 25e-6, 1e-6]) @ rotations.transpose(0, 2, 1)
+    half_axes_m, quaternions = recording.ellipsoids(cov)
+    np.testing.assert_allclose(half_axes_m, [[0.002, 0.004, 0.010]] * 20, rtol=1e-9)
+    axes = geometry.rotation_from_wxyz(quaternions[:, [3, 0, 1, 2]])
+    alignment = np.abs(np.einsum("nij,nik->njk", rotations, axes))  # of the known axes with those of the ellipsoid
+    np.testing.assert_allclose(alignment, [[[0, 1, 0], [0, 0, 1], [1, 0, 0]]] * 20, atol=1e-6)
+
+
+@pytest.mark.parametrize("sigma_m", [1e-7, 3e-5, 1e-3, 0.2, 30.0])
+def test_the_enlargement_is_the_largest_with_which_ellipsoids_stay_small(sigma_m):
+    half_axes_m = sigma_m * np.array([[0.1, 0.5, 2.0], [0.1, 0.2, 0.3]])
+    factor = recording.enlargement(half_axes_m, 4.0)
+    assert factor == 1 or factor * 2 * sigma_m <= 0.05 * 4.0
+    assert factor == 10_000 or 10 * factor * 2 * sigma_m > 0.05 * 4.0
+
+
+def test_the_recording_has_the_ellipsoids_of_the_final_covariances(folder):
+    """All standard deviations of the synthetic survey are 1 cm, so that two of them reach 2 cm of a path over 4 m."""
+    run = load_run(folder)
+    file = recording.record_run(run)
+    shown = rows(file, "/world/position_2_sigma_times_10")
+    assert len(shown) == recording.N_SNAPSHOTS
+    np.testing.assert_allclose(shown[-1]["half_sizes"], np.full((87, 3), 10 * 0.02), rtol=1e-6)
+    np.testing.assert_allclose(shown[-1]["centers"], run.network.positions, atol=1e-6)
+    assert [len(row["centers"]) for row in shown][:3] == [1, 4, 8]  # those up to the keyframe of the snapshot
+
+
+def test_covariances_of_positions_are_turned_into_the_world():
+    """The same motion of the same noise, seen from the world: samples of positions have this covariance."""
+    rng, poses = np.random.default_rng(1), np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, :3] = random_rotations(3, 2)
+    root = rng.normal(0, 0.01, (3, 6, 6))
+    cov = root @ root.transpose(0, 2, 1)
+    cov[2, 4, 4] = np.nan
+    result = SimpleNamespace(final=Trajectory(np.arange(3.0), poses), keyframe_rows=np.arange(3), node_cov=cov)
+    turned = position_cov_m2(result)  # pyright: ignore[reportArgumentType]
+    for k in range(2):
+        moved = [poses[k] @ geometry.exp(root[k] @ sample) for sample in rng.normal(0, 1, (20_000, 6))]
+        # the standard deviation of a variance of n samples is sqrt(2 / n) of it; five of them
+        np.testing.assert_allclose(turned[k], np.cov(np.array(moved)[:, :3, 3].T), atol=0.05 * turned[k].max())
+    assert np.isfinite(turned[2]).all()
+
+
+def test_normalised_residuals_of_links_are_one_for_consistent_covariances():
+    """The errors of the synthetic links are drawn from their covariances; here, the final poses are the true ones."""
+    result, _, truth, _ = survey()
+    residuals = link_residuals(replace(result, final=truth.trajectory))
+    assert len(residuals) == len(result.links) > 200
+    # r' C^-1 r / 6 has the variance 2 / 6, and the mean over n links sqrt(2 / 6 / n); four of them
+    assert np.mean(residuals**2) == pytest.approx(1, abs=4 * np.sqrt(2 / 6 / len(residuals)))
+
+
+def test_links_are_coloured_by_their_residuals(folder):
+    run = load_run(folder)
+    large = run.keyframes.link_residuals.copy()
+    large[:], large[-1] = 0.9, 3.1
+    marked = replace(run, keyframes=run.keyframes._replace(link_residuals=large))
+    last = rows(recording.record_run(marked), "/world/network")[-1]
+    colours = [f"{colour:08x}"[:6] for colour in last["colors"]]
+    assert colours[:-1] == ["7f96a3"] * (len(large) - 1) and colours[-1] == "cc3311"
+
+
+def test_events_of_the_log_are_logged_at_their_times(folder):
+    lines = [
+        '{"event": "started", "time_s": 0.0, "name": "synthetic"}',
+        '{"event": "vision", "time_s": 12.5, "status": "too few matches"}',
+        '{"event": "vision", "time_s": 13.0, "status": "ok"}',
+        '{"event": "aligned", "track": 1, "ms": 388.93616}',
+        '{"event": "finding", "text": "a doubt"}',
+        "null", "{}", '{"event": "aligned", "tra',
+    ]  # fmt: skip
+    (folder / "log.jsonl").write_text("\n".join(lines))
+    run = load_run(folder)
+    try:
+        events = rows(recording.record_run(run), "/events")
+    finally:
+        (folder / "log.jsonl").unlink()
+    end_of_track = int(run.keyframes.frames[run.keyframes.tracks == 1][-1])
+    expected = [
+        (0, "INFO", "event started, time_s 0, name synthetic"),
+        (125, "WARN", "event vision, time_s 12.5, status too few matches"),
+        (130, "INFO", "event vision, time_s 13, status ok"),
+        (end_of_track, "INFO", "event aligned, track 1, ms 388.9"),
+        (719, "WARN", "event finding, text a doubt"),
+        (719, "WARN", "event "),
+    ]
+    assert [(row["frame"], row["level"][0], row["text"][0]) for row in events] == expected
+
+
+def test_curves_of_the_attitude_are_those_of_the_body(folder):
+    """A camera that looks forward and down, on a body at known angles; the heading passes 180 deg."""
+    heading_deg = np.linspace(170, 190, 720)
+    bodies = [geometry.rotation_from_rpy(0.02, -0.05, np.deg2rad(angle)) for angle in heading_deg]
+    body_from_camera = geometry.pose(
+        geometry.rotation_from_rpy(0, -0.4, 0) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0.3, 0.0, 0.1])
+    )
+    run = load_run(folder)
+    path = Trajectory(run.times_s, np.array([geometry.pose(body, np.zeros(3)) @ body_from_camera for body in bodies]))
+    logged = {}
+
+    def log_curve(stream, run, entity, frames, values, role=""):
+        logged[entity] = values
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "log_curve", log_curve)
+        rig = replace(SCENARIO.believed_rig(), body_from_camera=body_from_camera)
+        recording.log_curves(None, replace(run, trajectories={"online": path}), rig)  # pyright: ignore[reportArgumentType]
+    np.testing.assert_allclose(logged["attitude/roll/online"], np.rad2deg(0.02), atol=1e-9)
+    np.testing.assert_allclose(logged["attitude/pitch/online"], np.rad2deg(-0.05), atol=1e-9)
+    np.testing.assert_allclose(logged["attitude/heading/online"], heading_deg, atol=1e-9)
+
+
+def views(part) -> list:
+    return (
+        [view for inner in part.contents for view in views(inner)]
+        if hasattr(part, "contents") and not isinstance(part, rrb.View)
+        else [part]
+    )
+
+
+def test_the_alignments_have_an_axis_of_their_own():
+    of_timing = {
+        view.origin: view.contents for view in views(recording.blueprint().root_container) if "timing" in view.origin
+    }
+    assert of_timing == {"/timing": ["$origin/**", "- $origin/ga"], "/timing/ga": "$origin/**"}
+
+
+def test_the_view_opens_with_all_of_the_survey_in_sight(folder):
+    """All corners of the map and all positions are within 27.5 deg of the optical axis of the viewer's eye."""
+    run = load_run(folder)
+    eye = recording._overview(run)
+    assert eye is not None
+    position, target = (np.array(part.as_arrow_array().to_pylist()[0]) for part in (eye.position, eye.look_target))
+    cells = np.stack([*np.meshgrid(*run.rasters["dem"].grid.centres()), run.rasters["dem"].values], axis=-1)
+    points = np.concatenate([run.trajectories["truth"].positions, cells[np.isfinite(run.rasters["dem"].values)]])
+    rays, axis = points - position, (target - position) / np.linalg.norm(target - position)
+    angles_deg = np.rad2deg(np.arccos(rays @ axis / np.linalg.norm(rays, axis=1)))
+    assert 10 < angles_deg.max() < 27.5
+
+
+def test_covariances_of_another_shape_are_rejected(folder, tmp_path):
+    index = json.loads((folder / "keyframes" / "index.json").read_text()) | {"position_cov_m2": [[[1.0, 2.0, 3.0]]]}
+    (tmp_path / "keyframes").mkdir()
+    (tmp_path / "scenario.resolved.toml").write_text("")
+    (tmp_path / "keyframes" / "index.json").write_text(json.dumps(index))
+    with pytest.raises(TwinError, match="position_cov_m2: must have 3 rows of 3 numbers for each keyframe"):
+        load_run(tmp_path)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from judge_synthetic import write_folder
+from judge_synthetic import SCENARIO, write_folder
 
 from twin.core import geometry
 from twin.core.records import Trajectory
@@ -38,8 +38,10 @@ def test_the_curves_of_a_replay_have_its_alignment(run, alignment, monkeypatch):
     assert np.abs(aligned - anchored).max() > 0.01
     replayed = of_replay(run, alignment)
     logged = {}
-    monkeypatch.setattr(recording, "log_curve", lambda _, entity, times, values, *role: logged.update({entity: values}))
-    recording.log_curves(recording.rr.RecordingStream("test"), replayed)
+    monkeypatch.setattr(
+        recording, "log_curve", lambda _, run, entity, frames, values, *role: logged.update({entity: values})
+    )
+    recording.log_curves(recording.rr.RecordingStream("test"), replayed, SCENARIO.believed_rig())
     curves = [
         survey_figures.path_error_curves(replayed).axes[0].lines[-1].get_ydata(),
         run_comparison.error_curves([(replayed, {})]).axes[1].lines[-1].get_ydata(),

@@ -152,6 +152,7 @@ def _fly_recorded(
             survey.gaps = fly(mission, world, survey.navigator, observe, actions, survey.loop, save_if_due)
     except (SurveyAborted, OSError, KeyboardInterrupt) as error:
         survey.cause = str(error) or "interrupted"
+        survey.folder.log("flight ended early", reason=survey.cause)
     survey.loop, survey.recorder, survey.flown = None, None, True
     checkpoints.save_last(survey)
     if checkpoints.problem:

@@ -1,10 +1,13 @@
 """Rerun recording of a survey (run.rrd) and live viewer. No other module imports rerun."""
 
+import json
+import os
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -17,26 +20,27 @@ from twin.report import recording_surfaces
 from twin.report.headline import badge, first_lines, headline, key_figures
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.replay_description import replayed_rig
+from twin.report.run_files import conform
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.scenario import file as scenario_file
 
 #: Largest number of keyframes whose images are logged; longest side of these images and of the orthomosaic [px].
 N_IMAGED, IMAGE_SIDE_PX, MOSAIC_PX = 500, 320, 1600
-#: Largest number of snapshots of growing entities (paths, network, map), and of samples of a time series.
-N_SNAPSHOTS, N_SAMPLES = 24, 5000
+#: Largest number of snapshots of growing entities (paths, network, map), samples of a curve, and ellipsoids.
+N_SNAPSHOTS, N_SAMPLES, N_ELLIPSOIDS = 24, 5000, 200
+#: Half axes of the ellipsoids [standard deviations], and the largest one drawn as a share of the extent of the path.
+N_SIGMA, LARGEST = 2, 0.05
+#: Names of the views of curves, by the entity above these curves.
+CURVES = {
+    "error/position": "Position error [m]", "error/height": "Height error [m]", "error/heading": "Heading error [deg]",
+    "attitude/roll": "Roll [deg]", "attitude/pitch": "Pitch [deg]", "attitude/heading": "Heading [deg]",
+}  # fmt: skip
 
 #: Command of the Rerun viewer; --bind makes it accept connections from this machine only.
 VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
 #: The true floor is translucent and lowered: it would flicker (z-fighting) where an accurate map coincides with it.
 TRUTH_ALPHA, TRUTH_BELOW_M = 110, 0.03
-
-
-class FrameTimes(NamedTuple):
-    """Frame numbers (n,) and their times (n,) [s]."""
-
-    frames: NDArray[np.int64]
-    times_s: Array
 
 
 def record_run(run: Run) -> Path:
@@ -48,62 +52,72 @@ def record_run(run: Run) -> Path:
     recording = rr.RecordingStream("twin", recording_id=run.folder.name)
     recording.save(file, default_blueprint=blueprint(_overview(run)))
     log_scene(recording, run)
-    log_paths(recording, run)
-    log_map(recording, run, rig)
-    log_cameras(recording, run, rig)
-    log_curves(recording, run)
+    if len(run.times_s):
+        log_paths(recording, run)
+        log_network(recording, run)
+        log_map(recording, run, rig)
+        log_cameras(recording, run, rig)
+        log_curves(recording, run, rig)
+        log_events(recording, run)
     recording.flush()
     recording.disconnect()
     return file
 
 
-def open_viewer(folder: Path) -> int:
-    """Opens a run in the Rerun viewer and returns the viewer's exit status. Writes run.rrd first if it is missing."""
+def open_viewer(folder: Path, web: bool = False) -> int:
+    """Opens a run in the Rerun viewer, with `web` in a browser, until it is closed; returns its exit status.
+
+    Writes run.rrd first if it is missing. A KeyboardInterrupt ends the viewer.
+    """
     file = Path(folder) / "run.rrd"
     if not file.is_file():
         record_run(load_run(folder))
-    return subprocess.run([*VIEWER, str(file)], check=False).returncode
+    viewer = subprocess.Popen([*VIEWER, *(["--web-viewer"] if web else []), str(file)], start_new_session=True)
+    try:
+        return viewer.wait()
+    except KeyboardInterrupt:
+        os.killpg(viewer.pid, signal.SIGTERM)
+        return 0
 
 
 def blueprint(viewpoint: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
     """Returns the layout of the viewer: 3-D view on the left; cameras, mosaic and curves on the right."""
-    cameras = rrb.Horizontal(
-        rrb.Spatial2DView(origin="/world/rig/left", name="Left camera"),
-        rrb.Spatial2DView(origin="/world/rig/right", name="Right camera"),
-    )
+    sides = {"left": "Left camera", "right": "Right camera"}
+    cameras = rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/world/rig/{s}", name=name) for s, name in sides.items()])
     pictures = rrb.Tabs(
-        rrb.Spatial2DView(origin="/mosaic", name="Mosaic"), rrb.TextDocumentView(origin="/summary", name="Summary")
+        rrb.Spatial2DView(origin="/mosaic", name="Mosaic"), rrb.TextDocumentView(origin="/summary", name="Summary"),
+        rrb.TextLogView(origin="/events", name="Events"),
+    )  # fmt: skip
+    views = rrb.Tabs(*[rrb.TimeSeriesView(origin=f"/{origin}", name=name) for origin, name in CURVES.items()])
+    timing = rrb.Horizontal(  # on axes of their own, as an alignment takes much longer than a frame
+        rrb.TimeSeriesView(origin="/timing", contents=["$origin/**", "- $origin/ga"], name="Time per call [ms]"),
+        rrb.TimeSeriesView(origin="/timing/ga", name="Time per global alignment [ms]"),
     )
-    units = {"position": "m", "height": "m", "heading": "deg"}
-    curves = rrb.Tabs(
-        *[
-            rrb.TimeSeriesView(origin=f"/error/{name}", name=f"{name.capitalize()} error [{unit}]")
-            for name, unit in units.items()
-        ]
-    )
-    timing = rrb.TimeSeriesView(origin="/timing", name="Time per call [ms]")
     survey = rrb.Spatial3DView(origin="/world", name="Survey", eye_controls=viewpoint)
     return rrb.Blueprint(
-        rrb.Horizontal(survey, rrb.Vertical(cameras, pictures, curves, timing), column_shares=[3, 2]),
-        rrb.TimePanel(state="collapsed", timeline="frame"),
+        rrb.Horizontal(survey, rrb.Vertical(cameras, pictures, views, timing), column_shares=[3, 2]),
+        rrb.TimePanel(state="collapsed", timeline="frame", play_state="following"),
         rrb.SelectionPanel(state="hidden"),
     )
 
 
 def _overview(run: Run) -> rrb.EyeControls3D | None:
-    """Returns a viewpoint above and south of the survey that shows all of it; None without a trajectory."""
-    paths = [path.positions for path in run.trajectories.values() if len(path)]
-    if not paths:
+    """Returns a viewpoint above and south of the survey that shows all paths and the map; None without a trajectory."""
+    points = [path.positions for path in run.trajectories.values() if len(path)]
+    if not points:
         return None
-    low, high = (getattr(np.concatenate(paths), side)(axis=0) for side in ("min", "max"))
-    target = np.array([*(low + high)[:2] / 2, low[2] / 2])
-    distance = max(1.0, float(np.linalg.norm((high - low)[:2])))
-    position = target + distance * np.array([0.0, -0.75, 0.9])
+    if "dem" in run.rasters:
+        heights, (x, y) = run.rasters["dem"].values[::9, ::9], run.rasters["dem"].grid.centres()
+        cells = np.stack([*np.meshgrid(x[::9], y[::9]), heights], axis=-1)[np.isfinite(heights)]
+        points.append(geometry.transform(geometry.inverse(run.keyframes.map_from_world), cells))
+    low, high = (getattr(np.concatenate(points), side)(axis=0) for side in ("min", "max"))
+    target, radius = (low + high) / 2, max(0.5, float(np.linalg.norm(high - low)) / 2)
+    position = target + 2.2 * radius * np.array([0.0, -0.6, 0.8])  # the viewer's field of view is 55 deg high
     return rrb.EyeControls3D(position=position, look_target=target, eye_up=[0, 0, 1])
 
 
 def log_scene(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the static entities: axes, summary and, where the run has them, true floor, planned path and orthomosaic."""
+    """Logs the static entities: axes, summary and, where the run has them, true floor and planned path."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     summary = "\n".join(
         [f"# {run.scenario.get('name', run.folder.name)}: {badge(run.metrics).text}", ""]
@@ -118,71 +132,77 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
         recording.log("world/true_floor", surface_mesh(floor, alpha=TRUTH_ALPHA), static=True)
     if "reference" in run.trajectories:
         positions = run.trajectories["reference"].positions
-        planned = line(positions[:: stride(len(positions))], "reference")
-        recording.log("world/path/reference", planned, static=True)
-    if "mosaic" in run.rasters:
-        recording.log("mosaic", jpeg(run.rasters["mosaic"].values, MOSAIC_PX), static=True)
+        recording.log("world/path/reference", line(positions[:: stride(len(positions))], "reference"), static=True)
 
 
 def log_paths(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time the part up to then."""
+    """Logs the trajectories at up to `N_SNAPSHOTS` times, each time the part up to then."""
     paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
     for name, path in paths.items():
-        for end in np.unique(np.linspace(1, len(path), min(N_SNAPSHOTS, len(path))).astype(int)):
-            _set_time(recording, end - 1, float(path.times_s[end - 1]))
-            recording.log(f"world/path/{name}", line(path.positions[: end : stride(end)], name))
-    for last, frame_and_time in snapshots(run):
-        edges = run.network.edges[run.network.edges.max(axis=1) <= last]
-        _set_time(recording, *frame_and_time)
-        recording.log("world/network", segments(run.network.positions[edges], "link"))
-    recording.reset_time()
+        for last in snapshots(len(path)):
+            _set_time(recording, run, last)
+            recording.log(f"world/path/{name}", line(path.positions[: last + 1 : stride(last)], name))
+
+
+def log_network(recording: rr.RecordingStream, run: Run) -> None:
+    """Logs at the snapshots the links so far and the ellipsoids of some keyframes, enlarged as their name says."""
+    keys, (positions, edges) = run.keyframes, run.network
+    residuals = keys.link_residuals if len(keys.link_residuals) == len(edges) else np.zeros(len(edges))
+    shown = np.arange(0, min(len(keys.position_cov_m2), len(positions)), stride(len(positions), N_ELLIPSOIDS))
+    half_axes_m, quaternions = ellipsoids(keys.position_cov_m2[shown])
+    factor = enlargement(half_axes_m, np.linalg.norm(positions - positions[:1], axis=1).max(initial=0))
+    for last in snapshots(len(keys.frames)):
+        _set_time(recording, run, keys.frames[last])
+        links, n = edges.max(axis=1) <= last, np.searchsorted(shown, last, side="right")
+        strips, colours = positions[edges[links]].astype(np.float32), residual_colours(residuals[links])
+        recording.log("world/network", rr.LineStrips3D(strips, colors=colours, radii=rr.Radius.ui_points(0.6)))
+        if n:
+            at, half_axes, turns = positions[shown[:n]], factor * half_axes_m[:n], quaternions[:n]
+            some = rr.Ellipsoids3D(centers=at, half_sizes=half_axes, quaternions=turns, colors=rgb("final"))
+            recording.log(f"world/position_{N_SIGMA}_sigma_times_{factor}", some)
 
 
 def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """Logs the final elevation map; each part appears at the first snapshot whose keyframes observe it, if any."""
-    if "dem" not in run.rasters or "final" not in run.trajectories or not len(run.keyframes.frames):
+    """Logs the final elevation map, each part at the first snapshot whose keyframes observe it, and the orthomosaic."""
+    if "mosaic" in run.rasters:
+        _set_time(recording, run, len(run.times_s) - 1)  # it is not known before
+        recording.log("mosaic", jpeg(run.rasters["mosaic"].values, MOSAIC_PX))
+    frames = run.keyframes.frames
+    if "dem" not in run.rasters or "final" not in run.trajectories or not len(frames):
         return
     surface = recording_surfaces.map_surface(run.rasters["dem"], run.rasters.get("mosaic"))
     surface = recording_surfaces.in_world(surface, run.keyframes.map_from_world)
-    steps = list(snapshots(run))
-    poses = run.trajectories["final"].world_from_camera[run.keyframes.frames]
-    groups = np.split(poses, [last + 1 for last, _ in steps])[:-1]
+    steps = snapshots(len(frames))
+    groups = np.split(run.trajectories["final"].world_from_camera[frames], [last + 1 for last in steps])[:-1]
     first_observed = recording_surfaces.first_observed(surface.points, groups, rig)
-    for number, (_, frame_and_time) in enumerate(steps):
+    for number, last in enumerate(steps):
         part = recording_surfaces.submesh(surface, first_observed, number)
         if len(part.triangles):
-            _set_time(recording, *frame_and_time)
+            _set_time(recording, run, frames[last])
             recording.log(f"world/map/{number:02d}", surface_mesh(part))
-    recording.reset_time()
 
 
 def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
     """Logs the rig and its images along the true path, or along the online estimate if there is none."""
-    name = "truth" if "truth" in run.trajectories else "online"
-    if name not in run.trajectories or not len(run.trajectories[name]):
+    path = run.trajectories.get("truth", run.trajectories.get("online"))
+    if path is None:
         return
-    path = run.trajectories[name]
-    rows = subsampled_rows(len(path))
+    rows = np.arange(0, len(path), stride(len(path)))
     log_rig(recording, rig)
     poses = path.world_from_camera[rows]
-    quaternions = [geometry.quaternion_xyzw(pose[:3, :3]) for pose in poses]
+    quaternions = geometry.quaternions_xyzw(poses[:, :3, :3])
     columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quaternions)
-    recording.send_columns("world/rig", time_columns(FrameTimes(rows, path.times_s[rows])), columns)
+    recording.send_columns("world/rig", time_columns(run, rows), columns)
     frames = [frame for frame in run.frames_with_image() if frame < len(path)]
-    shown = np.array(frames, dtype=np.int64)[:: stride(len(frames), N_IMAGED)]
+    shown = frames[:: stride(len(frames), N_IMAGED)]
     for side in ("left", "right"):
-        _send_images(recording, run, side, FrameTimes(shown, path.times_s[shown]))
-
-
-def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: FrameTimes) -> None:
-    images = (read_rgb(run.image_file(int(f), side)) for f in times.frames)  # one by one: 500 large ones take 3 GB
-    encoded = [None if image is None else jpeg_bytes(image, IMAGE_SIDE_PX) for image in images]
-    exists = np.array([data is not None for data in encoded], dtype=bool)
-    if exists.any():
-        data = [data for data in encoded if data is not None]
-        columns = rr.EncodedImage.columns(blob=data, media_type=["image/jpeg"] * len(data))
-        shown = FrameTimes(times.frames[exists], times.times_s[exists])
-        recording.send_columns(f"world/rig/{side}", time_columns(shown), columns)
+        blobs: dict[int, bytes] = {}
+        for frame in shown:  # one by one: 500 large images take 3 GB
+            if (image := read_rgb(run.image_file(frame, side))) is not None:
+                blobs[frame] = jpeg_bytes(image, IMAGE_SIDE_PX)
+        if blobs:
+            columns = rr.EncodedImage.columns(blob=list(blobs.values()), media_type=["image/jpeg"] * len(blobs))
+            recording.send_columns(f"world/rig/{side}", time_columns(run, np.array(list(blobs))), columns)
 
 
 def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
@@ -198,36 +218,52 @@ def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
     recording.log("world/rig/right", rr.Transform3D(translation=rig.left_from_right[:3, 3]), camera, static=True)
 
 
-def log_curves(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the errors of every estimate, if the true path is known, and the durations of the processing stages."""
-    if "truth" in run.trajectories:
-        for name in ESTIMATES:
-            if name in run.trajectories:
-                _log_errors(recording, run, name)
-    for stage, (times, values) in stage_durations(run).items():
-        log_curve(recording, f"timing/{stage}", times, values)
-        if len(values) == 1:
-            recording.log(f"timing/{stage}", rr.SeriesPoints(marker_sizes=4), static=True)
-
-
-def _log_errors(recording: rr.RecordingStream, run: Run, name: str) -> None:
-    errors, truth = run.errors(name), run.trajectories["truth"]
-    rows = subsampled_rows(len(errors.travelled_m))
-    times = FrameTimes(rows, truth.times_s[rows])
-    log_curve(recording, f"error/position/{name}", times, errors.distance_m[rows], name)
-    log_curve(recording, f"error/height/{name}", times, errors.position_m[rows, 2], name)
-    log_curve(recording, f"error/heading/{name}", times, np.rad2deg(errors.heading_rad[rows]), name)
+def log_curves(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
+    """Logs attitude and, where the truth is known, errors of all paths, and the durations of the stages."""
+    down = geometry.BODY_FROM_DOWN_CAMERA if "replay" in run.scenario else rig.body_from_camera[:3, :3]
+    for name in ("truth", *ESTIMATES):
+        if (path := run.trajectories.get(name)) is not None:
+            frames = np.arange(0, len(path), stride(len(path)))
+            bodies = path.world_from_camera[frames, :3, :3] @ down.T
+            angles = np.array([geometry.rpy_from_rotation(body) for body in bodies]).reshape(-1, 3)
+            for angle, values in zip(("roll", "pitch", "heading"), np.unwrap(angles, axis=0).T, strict=True):
+                log_curve(recording, run, f"attitude/{angle}/{name}", frames, np.rad2deg(values), name)
+            if name != "truth" and "truth" in run.trajectories:
+                errors = run.errors(name)
+                frames, heading_deg = np.arange(len(errors.travelled_m)), np.rad2deg(errors.heading_rad)
+                log_curve(recording, run, f"error/position/{name}", frames, errors.distance_m, name)
+                log_curve(recording, run, f"error/height/{name}", frames, errors.position_m[:, 2], name)
+                log_curve(recording, run, f"error/heading/{name}", frames, heading_deg, name)
+    for stage, (frames, values) in stage_durations(run).items():
+        log_curve(recording, run, f"timing/{stage}", frames, values)
 
 
 def log_curve(
-    recording: rr.RecordingStream, entity: str, times: FrameTimes, values: Array, role: str | None = None
+    recording: rr.RecordingStream, run: Run, entity: str, frames: NDArray[np.int64], values: Array, role: str = ""
 ) -> None:
     """Logs one curve; `role` is the key of its colour and label, by default those of Rerun and the entity's name."""
     if len(values):
         style: dict[str, Any] = {"names": LABELS[role] if role else entity.split("/")[-1]}
-        style |= {"colors": rgb(role)} if role else {}
+        style |= {"colors": colour(role)} if role else {}
         recording.log(entity, rr.SeriesLines(**style), static=True)
-        recording.send_columns(entity, time_columns(times), rr.Scalars.columns(scalars=values))
+        if len(values) == 1:
+            recording.log(entity, rr.SeriesPoints(marker_sizes=4), static=True)
+        thin = slice(None, None, stride(len(values)))
+        recording.send_columns(entity, time_columns(run, frames[thin]), rr.Scalars.columns(scalars=values[thin]))
+
+
+def log_events(recording: rr.RecordingStream, run: Run) -> None:
+    """Logs the events of the log, each at its time, at the end of its track or, without both, at the end."""
+    file, keys = run.folder / "log.jsonl", run.keyframes
+    for text in file.read_text("utf-8", "replace").splitlines() if file.is_file() else ():
+        with suppress(ValueError):  # an incomplete line: the survey was killed, or the disk full
+            event = {"event": ""} | conform(json.loads(text), {"event": "", "time_s": 0.0, "track": 0})
+            of_track = keys.frames[keys.tracks <= event.get("track", 0)]
+            at = np.searchsorted(run.times_s[:-1], event.get("time_s", np.inf))
+            _set_time(recording, run, of_track[-1] if len(of_track) else at)
+            texts = [f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in event.items()]
+            usual = event["event"] in ("started", "aligned", "complete") or event.get("status") == "ok"
+            recording.log("events", rr.TextLog(", ".join(texts), level="INFO" if usual else "WARN"))
 
 
 class LiveViewer:
@@ -246,7 +282,8 @@ class LiveViewer:
     def log_frame(self, frame: Frame, estimate: Estimate) -> None:
         """Logs pose and sigma of a frame; for a frame with a stereo pair, also the images and the path so far."""
         pose = estimate.world_from_camera
-        _set_time(self.recording, frame.index, frame.time_s)
+        self.recording.set_time("frame", sequence=frame.index)
+        self.recording.set_time("sim_time", duration=frame.time_s)
         quaternion = rr.Quaternion(xyzw=geometry.quaternion_xyzw(pose[:3, :3]))
         self.recording.log("world/rig", rr.Transform3D(translation=pose[:3, 3], quaternion=quaternion))
         self.recording.log("error/position/sigma", rr.Scalars(estimate.sigma_m))
@@ -262,12 +299,27 @@ def colour(role: str) -> tuple[int, int, int]:
     return (245, 245, 245) if role == "truth" else rgb(role)
 
 
+def ellipsoids(cov: Array) -> tuple[Array, Array]:
+    """Returns half axes (n, 3) [m] and orientations (n, 4) (xyzw) of ellipsoids of covariances (n, 3, 3) [m^2]."""
+    variances, axes = np.linalg.eigh(cov)
+    axes[..., 0] *= np.linalg.det(axes)[:, None]  # a rotation
+    return N_SIGMA * np.sqrt(np.maximum(variances, 0)), geometry.quaternions_xyzw(np.ascontiguousarray(axes))
+
+
+def enlargement(half_axes_m: Array, extent_m: float) -> int:
+    """Returns the largest of 1, 10, ..., 10000 with which no half axis exceeds the share `LARGEST` of the extent."""
+    ratio = LARGEST * max(extent_m, 1e-9) / half_axes_m.max(initial=1e-9)
+    return 10 ** int(np.clip(np.floor(np.log10(ratio)), 0, 4))
+
+
+def residual_colours(residuals: Array) -> Image:
+    """Returns RGB colours (m, 3) of normalised residuals of links: grey up to 1, red from 3."""
+    share = np.clip((residuals - 1) / 2, 0, 1)[:, None]
+    return np.round((1 - share) * rgb("link") + share * rgb("limit")).astype(np.uint8)
+
+
 def line(positions: Array, role: str) -> rr.LineStrips3D:
     return rr.LineStrips3D([positions.astype(np.float32)], colors=[colour(role)], radii=rr.Radius.ui_points(1.5))
-
-
-def segments(pairs: Array, role: str) -> rr.LineStrips3D:
-    return rr.LineStrips3D(pairs.astype(np.float32), colors=[colour(role)], radii=rr.Radius.ui_points(0.6))
 
 
 def surface_mesh(surface: recording_surfaces.Surface, alpha: int = 255) -> rr.Mesh3D:
@@ -283,50 +335,31 @@ def jpeg(image: Image, longest_px: int) -> rr.EncodedImage:
     return rr.EncodedImage(contents=jpeg_bytes(image, longest_px), media_type="image/jpeg")
 
 
-def time_columns(times: FrameTimes) -> list[rr.TimeColumn]:
-    return [rr.TimeColumn("frame", sequence=times.frames), rr.TimeColumn("sim_time", duration=times.times_s)]
+def time_columns(run: Run, frames: NDArray[np.int64]) -> list[rr.TimeColumn]:
+    return [rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("sim_time", duration=run.times_s[frames])]
 
 
-def _set_time(recording: rr.RecordingStream, frame: int, time_s: float) -> None:
+def _set_time(recording: rr.RecordingStream, run: Run, frame: int | np.int64) -> None:
     recording.set_time("frame", sequence=int(frame))
-    recording.set_time("sim_time", duration=float(time_s))
+    recording.set_time("sim_time", duration=float(run.times_s[frame]))
 
 
-def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
-    """Yields the last keyframe of each snapshot: (keyframe number, (frame number, time [s]))."""
-    path, frames = run.trajectories.get("online"), run.keyframes.frames
-    if path is None or not len(frames):
-        return
-    for k in np.unique(np.linspace(0, len(frames) - 1, min(N_SNAPSHOTS, len(frames))).astype(int)):
-        yield int(k), (int(frames[k]), float(path.times_s[frames[k]]))
+def snapshots(n: int) -> list[int]:
+    """Returns at most `N_SNAPSHOTS` of the indices 0 to n - 1, evenly distributed, with the last one."""
+    return np.unique(np.linspace(0, n - 1, min(N_SNAPSHOTS, n)).astype(int)).tolist()
 
 
-def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
-    """Returns, by stage, the frames of at most `N_SAMPLES` calls and their durations [ms]; "ga" is the alignment."""
-    path = run.trajectories.get("online")
-    if path is None:
-        return {}
-    keyframes = run.keyframes.frames
-    frames_by_count = {len(keyframes): keyframes, len(path): np.arange(len(path))}
-    timing_ms = run.keyframes.timing_ms
-    durations = {s: (frames_by_count[len(v)], v) for s, v in timing_ms.items() if len(v) in frames_by_count}
-    durations |= _alignment_durations(run)
-    thin = {s: (f[:: stride(len(f))], v[:: stride(len(f))]) for s, (f, v) in durations.items()}
-    return {stage: (FrameTimes(frames, path.times_s[frames]), values) for stage, (frames, values) in thin.items()}
-
-
-def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Returns {"ga": (frames, durations [ms])} of the global alignments, each at the last keyframe of its track."""
+def stage_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
+    """Returns, by stage, the frames of its calls and their durations [ms]; "ga" is at the last keyframe of a track."""
     keys, tracks = run.keyframes, (run.metrics or {}).get("tracks") or []
+    n_frames = len(run.trajectories.get("online", ()))
+    frames_by_count = {len(keys.frames): keys.frames, n_frames: np.arange(n_frames)}
+    found = {s: (frames_by_count[len(v)], v) for s, v in keys.timing_ms.items() if len(v) in frames_by_count}
     timed = [(keys.frames[keys.tracks <= row["track"]], row["ga_ms"]) for row in tracks if row["ga_ms"] is not None]
     rows = [(frames[-1], ms) for frames, ms in timed if len(frames)]
-    return {"ga": (np.array([f for f, _ in rows]), np.array([ms for _, ms in rows], dtype=float))} if rows else {}
+    return found | {"ga": (np.array([frame for frame, _ in rows]), np.array([ms for _, ms in rows], float))}
 
 
 def stride(n: int, limit: int = N_SAMPLES) -> int:
     """Returns the smallest stride with which at most `limit` of n items are kept."""
     return max(1, -(-n // limit))
-
-
-def subsampled_rows(n: int) -> NDArray[np.int64]:
-    return np.arange(0, n, stride(n))

@@ -31,6 +31,8 @@ _INDEX = {
     "timing_ms": {_ANY: [0.0]},
     "stereo_observations": [{name: _NAN for name in OBSERVATION_KEYS}],
     "map_from_world": [[0.0]],
+    "position_cov_m2": [[[0.0]]],
+    "link_residuals": [0.0],
     "asked_m2": None,
     "asked_area_m": [[[0.0]]],
 }
@@ -61,6 +63,8 @@ def checked_index(index: Any) -> dict[str, Any]:
         raise ValueError("tracks: must have one number per frame")
     if "map_from_world" in index and [len(row) for row in index["map_from_world"]] != [4] * 4:
         raise ValueError("map_from_world: must have 4 rows of 4 numbers")
+    if any([len(row) for row in cov] != [3, 3, 3] for cov in index.get("position_cov_m2", [])):
+        raise ValueError("position_cov_m2: must have 3 rows of 3 numbers for each keyframe")
     if any(len(corner) != 2 for ring in index.get("asked_area_m", []) for corner in ring):
         raise ValueError("asked_area_m: must be rings of corners with 2 numbers")
     return index

@@ -41,6 +41,8 @@ class Keyframes(NamedTuple):
     map_from_world: Array  # (4, 4) pose of the world in the frame of the maps (`ElevationMap.map_from_world`)
     asked_m2: float | None = None  # size of the asked area; None: not known
     asked_area_m: tuple[Array, ...] = ()  # rings (n, 2) around the asked area and its holes, in the map [m]
+    position_cov_m2: Array = np.zeros((0, 3, 3))  # (n, 3, 3) of the final positions in the world; n = 0: not known
+    link_residuals: Array = np.zeros(0)  # (m,) normalised residuals of the links; m = 0: not known
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,11 @@ class Run:
     @property
     def finished(self) -> bool:
         return self.metrics is not None
+
+    @property
+    def times_s(self) -> Array:
+        """Returns the times (n,) of all frames."""
+        return max((path.times_s for path in self.trajectories.values()), key=len, default=np.zeros(0))
 
     @property
     def alignment(self) -> AlignmentName | None:
@@ -119,9 +126,10 @@ def _read_keyframes(file: Path) -> Keyframes:
     stereo_observations = np.array(rows, float).reshape(-1, 3)
     map_from_world = np.array(index.get("map_from_world", np.eye(4)), float)
     rings = tuple(np.array(ring, float).reshape(-1, 2) for ring in index.get("asked_area_m", []))
+    position_cov_m2 = np.array(index.get("position_cov_m2", []), float).reshape(-1, 3, 3)
     return Keyframes(
         frames, tracks, index.get("n_frames_per_keyframe"), timing_ms, stereo_observations, map_from_world,
-        index.get("asked_m2"), rings,
+        index.get("asked_m2"), rings, position_cov_m2, np.array(index.get("link_residuals", []), float),
     )  # fmt: skip
 
 

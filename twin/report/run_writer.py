@@ -98,7 +98,7 @@ class RunFolder:
             self._reserve.write_bytes(bytes(_RESERVE_BYTES))
         except OSError as error:
             raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder with space") from None
-        self.log("started", name=scenario.name, seed=scenario.seed)
+        self.log("started", time_s=0.0, name=scenario.name, seed=scenario.seed)
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"_log": flushed_length(self._log)}
@@ -209,6 +209,8 @@ class RunFolder:
             "tracks": result.track_of_keyframe.tolist(),
             "stereo_observations": [observation._asdict() for observation in result.stereo_observations],
             "n_frames_per_keyframe": record.n_frames_per_keyframe,
+            "position_cov_m2": position_cov_m2(result).round(15).tolist(),
+            "link_residuals": link_residuals(result).round(4).tolist(),
             "timing_ms": {stage: record.stopwatch.durations_ms(stage) for stage in ("f2f", "stereo")},
         }
         if record.elevation is not None:
@@ -267,6 +269,25 @@ def _write_optional_output(name: str, run: "Run") -> None:
 
 def _error_m(elevation: ElevationMap, truth: Truth) -> NDArray[np.float32]:
     return np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
+
+
+def position_cov_m2(result: SurveyResult) -> Array:
+    """Returns the covariances (n, 3, 3) [m^2] of the final positions of keyframes in the world; 0 if not known."""
+    rotation = result.final.world_from_camera[result.keyframe_rows[: len(result.node_cov)], :3, :3]
+    cov = np.nan_to_num(result.node_cov[: len(rotation), 3:, 3:], posinf=0, neginf=0)
+    return rotation @ cov @ rotation.transpose(0, 2, 1)
+
+
+def link_residuals(result: SurveyResult) -> Array:
+    """Returns the normalised residuals sqrt(r' C^-1 r / 6) (m,) of links; about 1 for consistent covariances.
+
+    r is the residual at the final poses and C the covariance of the measurement (`network_errors.network_residuals`).
+    """
+    poses, links = result.final.world_from_camera[result.keyframe_rows], result.links
+    motions = np.linalg.inv(links.i_from_j) @ np.linalg.inv(poses[links.i]) @ poses[links.j]
+    residuals = np.array([geometry.log(motion) for motion in motions]).reshape(-1, 6)
+    chi2 = links.shared_by * np.einsum("ni,nij,nj->n", residuals, links.information, residuals)
+    return np.sqrt(np.clip(np.nan_to_num(chi2), 0, 1e12) / 6)
 
 
 def rings_around(cells: NDArray[np.bool_], grid: MapGrid) -> list[Array]:
