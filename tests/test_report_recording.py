@@ -1,9 +1,15 @@
 """Rerun recording: it has every entity on both timelines and stays small."""
 
 import json
+import os
+import signal
+import socket
+import threading
 import time
+import urllib.request
 import weakref
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -396,3 +402,44 @@ def test_covariances_of_another_shape_are_rejected(folder, tmp_path):
     (tmp_path / "keyframes" / "index.json").write_text(json.dumps(index))
     with pytest.raises(TwinError, match="position_cov_m2: must have 3 rows of 3 numbers for each keyframe"):
         load_run(tmp_path)
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+def listening_at(port: int) -> list[str]:
+    """Returns the addresses at which processes of this machine accept connections to a port."""
+    rows = [line.split() for file in ("tcp", "tcp6") for line in Path("/proc/net", file).read_text().splitlines()[1:]]
+    ends = [row[1].split(":") for row in rows if row[3] == "0A"]  # in the state LISTEN
+    return [address for address, number in ends if int(number, 16) == port]
+
+
+@pytest.mark.long
+def test_a_browser_of_this_machine_alone_is_served_until_ctrl_c(folder, monkeypatch, capfd):
+    web, data = free_port(), free_port()
+    ports = ("--web-viewer-port", str(web), "--port", str(data))
+    monkeypatch.setattr(recording, "VIEWER", (*recording.VIEWER, *ports))
+    monkeypatch.setenv("BROWSER", "true")  # the program, which opens nothing
+    seen = {}
+
+    def visit():
+        for _ in range(300):
+            try:
+                seen["page"] = urllib.request.urlopen(f"http://127.0.0.1:{web}/", timeout=5).read()
+                break
+            except OSError:
+                time.sleep(0.1)
+        seen.update({port: listening_at(port) for port in (web, data)})
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=visit).start()
+    assert recording.open_viewer(folder, web=True) == 0
+    assert b"<html" in seen["page"] and seen[web] == seen[data] == ["0100007F"]  # 127.0.0.1
+    assert capfd.readouterr().out.endswith(f"Closed {folder / 'run.rrd'}\n")
+    deadline = time.monotonic() + 10
+    while listening_at(web) + listening_at(data) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert listening_at(web) + listening_at(data) == []

@@ -550,12 +550,15 @@ def change(
 
 
 @app.command()
-def view(folder: RunFolder) -> None:
+def view(
+    folder: RunFolder,
+    web: Annotated[bool, option("Show it in a browser of this machine until Ctrl-C.", flag="--web")] = False,
+) -> None:
     """Open the recording of a run in Rerun."""
     from twin.report.recording import open_viewer
 
     with outputs.writing(folder, "RUN"):
-        raise typer.Exit(open_viewer(folder))
+        raise typer.Exit(open_viewer(folder, web))
 
 
 @app.command("new-plugin")

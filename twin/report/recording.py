@@ -72,12 +72,13 @@ def open_viewer(folder: Path, web: bool = False) -> int:
     file = Path(folder) / "run.rrd"
     if not file.is_file():
         record_run(load_run(folder))
-    viewer = subprocess.Popen([*VIEWER, *(["--web-viewer"] if web else []), str(file)], start_new_session=True)
-    try:
-        return viewer.wait()
-    except KeyboardInterrupt:
-        os.killpg(viewer.pid, signal.SIGTERM)
-        return 0
+    with subprocess.Popen([*VIEWER, *(["--web-viewer"] if web else []), str(file)], start_new_session=True) as viewer:
+        try:
+            return viewer.wait()
+        except KeyboardInterrupt:
+            os.killpg(viewer.pid, signal.SIGTERM)
+    print(f"Closed {file}")
+    return 0
 
 
 def blueprint(viewpoint: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
@@ -190,14 +191,14 @@ def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None
     rows = np.arange(0, len(path), stride(len(path)))
     log_rig(recording, rig)
     poses = path.world_from_camera[rows]
-    quaternions = geometry.quaternions_xyzw(poses[:, :3, :3])
-    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quaternions)
+    columns = rr.Transform3D.columns(
+        translation=poses[:, :3, 3], quaternion=geometry.quaternions_xyzw(poses[:, :3, :3])
+    )
     recording.send_columns("world/rig", time_columns(run, rows), columns)
     frames = [frame for frame in run.frames_with_image() if frame < len(path)]
-    shown = frames[:: stride(len(frames), N_IMAGED)]
     for side in ("left", "right"):
         blobs: dict[int, bytes] = {}
-        for frame in shown:  # one by one: 500 large images take 3 GB
+        for frame in frames[:: stride(len(frames), N_IMAGED)]:  # one by one: 500 large images take 3 GB
             if (image := read_rgb(run.image_file(frame, side))) is not None:
                 blobs[frame] = jpeg_bytes(image, IMAGE_SIDE_PX)
         if blobs:
@@ -352,8 +353,7 @@ def snapshots(n: int) -> list[int]:
 def stage_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
     """Returns, by stage, the frames of its calls and their durations [ms]; "ga" is at the last keyframe of a track."""
     keys, tracks = run.keyframes, (run.metrics or {}).get("tracks") or []
-    n_frames = len(run.trajectories.get("online", ()))
-    frames_by_count = {len(keys.frames): keys.frames, n_frames: np.arange(n_frames)}
+    frames_by_count = {len(f): f for f in (keys.frames, np.arange(len(run.trajectories.get("online", ()))))}
     found = {s: (frames_by_count[len(v)], v) for s, v in keys.timing_ms.items() if len(v) in frames_by_count}
     timed = [(keys.frames[keys.tracks <= row["track"]], row["ga_ms"]) for row in tracks if row["ga_ms"] is not None]
     rows = [(frames[-1], ms) for frames, ms in timed if len(frames)]
