@@ -30,7 +30,7 @@ N_IMAGED, IMAGE_SIDE_PX, MOSAIC_PX = 500, 320, 1600
 #: Largest number of snapshots of growing entities (paths, network, map), samples of a curve, and ellipsoids.
 N_SNAPSHOTS, N_SAMPLES, N_ELLIPSOIDS = 24, 5000, 200
 #: Half axes of the ellipsoids [standard deviations], and the largest one drawn as a share of the extent of the path.
-N_SIGMA, LARGEST = 2, 0.05
+N_SIGMA, LARGEST = 2, 0.02
 #: Names of the views of curves, by the entity above these curves.
 CURVES = {
     "error/position": "Position error [m]", "error/height": "Height error [m]", "error/heading": "Heading error [deg]",
@@ -113,7 +113,7 @@ def _overview(run: Run) -> rrb.EyeControls3D | None:
         points.append(geometry.transform(geometry.inverse(run.keyframes.map_from_world), cells))
     low, high = (getattr(np.concatenate(points), side)(axis=0) for side in ("min", "max"))
     target, radius = (low + high) / 2, max(0.5, float(np.linalg.norm(high - low)) / 2)
-    position = target + 2.2 * radius * np.array([0.0, -0.6, 0.8])  # the viewer's field of view is 55 deg high
+    position = target + 2.4 * radius * np.array([0.0, -0.6, 0.8])  # the viewer's field of view is 55 deg high
     return rrb.EyeControls3D(position=position, look_target=target, eye_up=[0, 0, 1])
 
 
