@@ -39,7 +39,7 @@ def runs(tmp_path):
 
 
 def row(runs, name):
-    return next(row for row in run_comparison.table(runs) if row.quantity.name == name).cells
+    return next(row for row in run_comparison.table(runs) if row.name == name).cells
 
 
 def test_differences_are_those_from_the_first_run_and_better_is_told_from_worse(runs):
@@ -54,7 +54,7 @@ def test_differences_are_those_from_the_first_run_and_better_is_told_from_worse(
 
 
 def test_a_quantity_that_no_run_has_is_left_out(runs):
-    assert "map.le90_m" not in [row.quantity.name for row in run_comparison.table(runs)]
+    assert "map.le90_m" not in [row.name for row in run_comparison.table(runs)]
 
 
 def test_runs_of_equal_folder_names_are_told_apart(runs):
@@ -76,6 +76,7 @@ def test_the_page_names_every_run_draws_the_curves_and_warns_of_different_floors
         "a/run",
         "b/worse",
         "+1.0 mm (+50 %)",
+        "b/run compared with a/run: position error (RMSE) 3.0 mm instead of 2.0 mm, worse; mapped part",
         "different floors or plans: seed.",
         "Differences of the scenar",
     ):
@@ -83,6 +84,19 @@ def test_the_page_names_every_run_draws_the_curves_and_warns_of_different_floors
     assert page.count("data:image/png;base64,") == 2  # position errors and paths; the runs have no maps
     same = run_comparison.render([runs[0], runs[2]])
     assert "different floors" not in same and "Differences of the scenarios" not in same
+
+
+def test_runs_whose_objects_differ_say_so_in_words(tmp_path):
+    runs = [write_run(tmp_path / name, 0.002, 0.9) for name in ("first", "second")]
+    for run, growth_m in zip(runs, (0.0, 0.05), strict=True):
+        entries = [f"[[objects]]\ncolour = [0.1, 0.2, 0.3]\nsize_m = 0.4\ngrowth_m = {g}\n" for g in (0.0, growth_m)]
+        with (run / "scenario.resolved.toml").open("a") as file:
+            file.write("".join(entries))
+    loaded = run_comparison.load_runs(runs)
+    assert run_comparison.scenario_differences(loaded) == {"objects.1.growth_m": ["0.0", "0.05"]}
+    page = run_comparison.render(loaded)
+    assert "surveys of different floors or plans: growth (objects entry 2)." in page
+    assert "<li>growth (objects entry 2): 0.0, 0.05</li>" in page
 
 
 def test_runs_without_truth_are_compared_by_their_paths_alone(runs):

@@ -38,7 +38,8 @@ def test_labels_of_a_logarithmic_axis_are_numbers_that_do_not_touch(low, ratio):
     [
         ("map.le90_m", 0.02, "0.02 m"), ("timing.ga_ms", 3.0, "3 ms"), ("timing.wall_s", 3.0, "3 s"),
         ("trajectory.final.heading_rmse_deg", 0.1, "0.1 deg"), ("orthomosaic.ce90_px", 1.5, "1.5 px"),
-        ("trajectory.final.drift_percent", 0.2, "0.2 %"), ("map.completeness", 0.95, "0.95"), ("map.le90_m", None, "–"),  # noqa: RUF001
+        ("trajectory.final.drift_percent", 0.2, "0.2 %"), ("map.completeness", 0.95, "95 %"),
+        ("plan.speed_mps", 0.35, "0.35 m/s"), ("plan.overlap_across", 0.7352, "73.5 %"), ("map.le90_m", None, "–"),  # noqa: RUF001
     ],
 )  # fmt: skip
 def test_a_limit_has_the_unit_of_its_metric(name, value, text):

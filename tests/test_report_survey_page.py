@@ -93,7 +93,7 @@ def test_the_report_names_the_causes_of_the_height_error(folder):
     page = write_report(folder, metrics).read_text()
     assert "64 % is noise of the stereo matching (contrast, blur and noise of the images), 36 % is errors" in page
     assert "Together they state an error of 5.0 mm" in page and "the true one is 5.2 mm" in page
-    assert "fly lower, overlap more, a longer baseline" in page
+    assert "lower flight, more overlap, a longer baseline" in page
 
 
 def test_the_report_of_an_unfinished_run_is_marked_as_unfinished(unfinished):

@@ -55,17 +55,17 @@ CASES = {
         dict(status="aborted", reason="interrupted; map skipped", **missed("map.completeness_area", None, 0.9)),
         "aborted, requirement missed", "bad",
         ["The survey was aborted: interrupted; map skipped.",
-         "Requirement missed: map.completeness_area is unknown, at least 0.9 is required."],
+         "Requirement missed: mapped part of the asked area is unknown, at least 90 % is required."],
     ),
     "missed": (
         dict(**missed("map.le90_m", 0.031)), "complete, requirement missed", "bad",
-        ["Requirement missed: map.le90_m is 0.031 m, at most 0.02 m is required."],
+        ["Requirement missed: height error on 90 % of the mapped cells (LE90) is 0.031 m, at most 0.02 m is required."],
     ),
     "holes": (
         dict(map={"completeness_area": 0.81, "le90_area_m": None}, **missed()),
         "complete, requirement missed", "bad",
-        ["Requirement missed: map.le90_area_m is infinite (only 81 % of the asked area has a height), "
-         "at most 0.02 m is required."],
+        ["Requirement missed: height error on 90 % of the asked area (LE90) is infinite (only 81 % of the asked area "
+         "has a height), at most 0.02 m is required."],
     ),
     "NEES": (
         dict(consistency={"nees_position_mean": 8.71}), "complete, with warnings", "warn",

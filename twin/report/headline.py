@@ -7,6 +7,7 @@ from twin.judge.map_error import INFINITE_WITH_HOLES
 from twin.judge.verdict import more_is_better, nees_bounds
 from twin.report.html import render_text
 from twin.report.number_formats import DASH, percent, with_unit
+from twin.report.words import words
 from twin.scenario.water_sources import WATER_SOURCES
 
 #: Level of a badge: green, amber or red. The name is also the badge's CSS class in page.css.
@@ -57,7 +58,7 @@ def _status(metrics: Mapping[str, Any]) -> list[str]:
 
 def _missed(metrics: Mapping[str, Any]) -> list[str]:
     return [
-        f"Requirement missed: {name} is {_value(name, row['value'], metrics)}, "
+        f"Requirement missed: {words(name)} is {_value(name, row['value'], metrics)}, "
         f"{'at least' if more_is_better(name) else 'at most'} {with_unit(name, row['limit'])} is required."
         for name, row in (metrics.get("require") or {}).items()
         if not row["passed"]

@@ -3,11 +3,11 @@
 import re
 from collections.abc import Callable, Mapping
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 
-from twin.report import number_formats
+from twin.report import number_formats, words
 
 _SHARED_TEMPLATES = "twin.report"
 #: Number formats by the names that they have in templates.
@@ -28,6 +28,35 @@ def render_text(template: str, context: Mapping[str, Any], package: str = _SHARE
     return _rendered(package, template, context, undefined=jinja2.ChainableUndefined)
 
 
+def render_rows(template: str, context: Mapping[str, Any], package: str = _SHARED_TEMPLATES) -> list[tuple[str, str]]:
+    """Returns (name, value) of each line "name | value" of a text template."""
+    lines = (line.partition(" | ") for line in render_text(template, context, package).splitlines())
+    return [(name, value) for name, _, value in lines]
+
+
+class Paragraph(NamedTuple):
+    """Answer to one question on the first screen of a page: text, then a list of sentences."""
+
+    title: str
+    text: str
+    items: list[str]
+
+
+def render_paragraphs(template: str, context: Mapping[str, Any], package: str) -> list[Paragraph]:
+    """Returns the paragraphs of a text template that are not empty: lines "# title", text, lines "- item"."""
+    _, *parts = re.split(r"^# (.*)\n", render_text(template, context, package), flags=re.MULTILINE)
+    bodies = ([" ".join(part.split()) for part in re.split(r"^- ", body, flags=re.MULTILINE)] for body in parts[1::2])
+    found = [Paragraph(title, text, items) for title, (text, *items) in zip(parts[::2], bodies, strict=True)]
+    return [paragraph for paragraph in found if paragraph.text or paragraph.items]
+
+
+def lines_of(paragraphs: list[Paragraph]) -> str:
+    """Returns paragraphs as text, a line each, with their titles except that of the first, the answer."""
+    titles = ("", *(paragraph.title for paragraph in paragraphs[1:]))
+    texts = (" ".join([one.text, *one.items]).strip() for one in paragraphs)
+    return "\n".join(f"{title} {text}".strip() for title, text in zip(titles, texts, strict=True))
+
+
 def _rendered(package: str, template: str, context: Mapping[str, Any], **options: Any) -> str:
     environment = jinja2.Environment(
         **options,
@@ -36,7 +65,8 @@ def _rendered(package: str, template: str, context: Mapping[str, Any], **options
         loader=jinja2.FunctionLoader(lambda name: _source(package, name) or _source(_SHARED_TEMPLATES, name)),
     )
     environment.filters |= {name: _of_defined(number) for name, number in _FILTERS.items()}
-    environment.filters["with_unit"] = number_formats.with_unit
+    environment.filters |= {"with_unit": number_formats.with_unit, "words": words.words, "label": words.label}
+    environment.filters |= {"with_words": words.with_words}
     return environment.get_template(template).render(**context)
 
 

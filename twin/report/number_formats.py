@@ -5,10 +5,16 @@ from collections.abc import Mapping
 from typing import Any
 
 DASH = "–"  # noqa: RUF001
-#: Units by the suffix of a metric's name.
-_UNITS = {
-    "_m": "m", "_s": "s", "_ms": "ms", "_deg": "deg", "_px": "px", "_percent": "%", "_mb": "MiB",
+#: Units by the suffix of the name of a metric or key.
+UNITS = {
+    "_per_m": "per m", "_per_m3": "per m3", "_m": "m", "_mm": "mm", "_s": "s", "_ms": "ms", "_mps": "m/s",
+    "_deg": "deg", "_px": "px", "_percent": "%", "_mb": "MiB", "_cd": "cd", "_lx": "lx",
 }  # fmt: skip
+#: Beginnings of the names of metrics and keys that are fractions.
+_FRACTIONS = (
+    "risk", "map.completeness", "overlap.", "plan.overlap_along", "plan.overlap_across",
+    "consistency.within_", "orthomosaic.matched", "orthomosaic.coverage_", "self_check.frames_lost",
+)  # fmt: skip
 
 
 def length(value_m: float | None) -> str:
@@ -52,19 +58,41 @@ def milliseconds(value_ms: float | None) -> str:
     return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"
 
 
+def duration(time_s: float) -> str:
+    """Returns a duration as text, in s below 90 s, else in min or, from 90 min, in h."""
+    if time_s < 90:
+        return f"{time_s:.0f} s"
+    return f"{time_s / 60:.0f} min" if time_s < 5400 else f"{time_s / 3600:.1f} h"
+
+
 def plain(value: Any) -> str:
     """Returns a value as text, a float with at most four significant digits; a dash for None."""
     return DASH if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def with_unit(name: str, value: float | None) -> str:
-    """Returns a number as `plain` with the unit that its dotted name ends with, e.g. "0.02 m"; a dash for None."""
+    """Returns a number as `plain` with the unit of its name, "0.02 m", a fraction in percent; a dash for None."""
+    if is_fraction(name):
+        return percent(value)
     return DASH if value is None else f"{plain(value)} {unit_of(name)}".rstrip()
 
 
+def metric_value(metric: str, value: float | None) -> str:
+    """Returns a metric, a length in mm, cm or m, an RMS angle in mrad; a dash for None, NaN and infinity."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    if metric.endswith("_rmse_deg"):
+        return milliradians(value)
+    return length(value) if metric.endswith("_m") else with_unit(metric, float(value))
+
+
+def is_fraction(name: str) -> bool:
+    return name.startswith(_FRACTIONS)
+
+
 def unit_of(name: str) -> str:
-    """Returns the unit of a metric, which its dotted name ends with; "" if it has none."""
-    return next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
+    """Returns the unit of a metric or key, which its dotted name ends with; "" if it has none."""
+    return next((unit for suffix, unit in UNITS.items() if name.endswith(suffix)), "")
 
 
 def area_le90(elevation: Mapping[str, Any]) -> str:

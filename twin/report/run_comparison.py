@@ -4,7 +4,7 @@ Each figure function returns None if no run has the data that its figure shows.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,13 +14,14 @@ from matplotlib.figure import Figure
 from twin.core.nested import leaves
 from twin.core.user_files import resolved
 from twin.errors import TwinError
-from twin.judge.verdict import numbers_of
+from twin.judge.verdict import more_is_better, numbers_of
 from twin.report.headline import badge, first_lines
-from twin.report.html import render_page
-from twin.report.number_formats import DASH, length, milliradians, percent, plain, ratio
+from twin.report.html import render_page, render_paragraphs
+from twin.report.number_formats import DASH, is_fraction, metric_value, ratio
 from twin.report.plotting import WIDTH_IN, add_coordinates, drawn, legend_beside, log_axis, log_scale, one_panel
 from twin.report.run_folder import Run, load_run
 from twin.report.style import COLOURS
+from twin.report.words import words
 
 #: Largest number of runs on one page; more curves cannot be told apart.
 MOST_RUNS = 8
@@ -28,40 +29,22 @@ MOST_RUNS = 8
 RUN_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6d76", "#000000")
 #: Line styles of the runs: coinciding curves stay visible.
 _RUN_STYLES = ("-", "--", "-.", ":") * 2
+#: Sections of the scenario that make another survey, of another floor or plan.
+_OF_SURVEY = ("seed", "scene_seed", "terrain", "objects", "plan")
 #: Runs, each with the style of its curves.
 Styled = Sequence[tuple[Run, dict[str, Any]]]
 
 
-class ComparedQuantity(NamedTuple):
-    """Metric that the comparison of runs shows in one row of its table."""
-
-    name: str  # dotted, in metrics.json
-    label: str
-    text: Callable[[Any], str]  # returns a value as text, with its unit unless the label has it
-    better: str = "less"  # or "more", or "" if neither smaller nor larger values are better
-
-
+#: Metrics that the table compares, in the order of its rows.
 QUANTITIES = (
-    ComparedQuantity("trajectory.f2f.ate_rmse_m", "position error, F2F only (RMSE)", length),
-    ComparedQuantity("trajectory.online.ate_rmse_m", "position error, online (RMSE)", length),
-    ComparedQuantity("trajectory.final.ate_rmse_m", "position error, final (RMSE)", length),
-    ComparedQuantity("trajectory.final.ate_max_m", "position error, final (maximum)", length),
-    ComparedQuantity("trajectory.final.z_rmse_m", "height error, final (RMSE)", length),
-    ComparedQuantity("trajectory.final.heading_rmse_deg", "heading error, final (RMSE)", milliradians),
-    ComparedQuantity("consistency.nees_position_mean", "NEES of the positions (mean; 3 is right)", plain, ""),
-    ComparedQuantity("map.le90_m", "LE90 of the map", length),
-    ComparedQuantity("map.nmad_m", "NMAD of the map", length),
-    ComparedQuantity("map.le90_area_m", "LE90 over the asked area", length),
-    ComparedQuantity("map.completeness", "completeness, observed floor", percent, "more"),
-    ComparedQuantity("map.completeness_area", "completeness, asked area", percent, "more"),
-    ComparedQuantity("orthomosaic.ce90_px", "CE90 of the orthomosaic [px]", plain),
-    ComparedQuantity("control.cross_track_rmse_m", "cross-track error (RMSE)", length),
-    ComparedQuantity("self_check.frames_lost", "frames without measured motion", percent),
-    ComparedQuantity("timing.frames", "frames", plain, ""),
-    ComparedQuantity("timing.keyframes", "keyframes", plain, ""),
-    ComparedQuantity("timing.wall_s", "computing time [s]", plain),
-    ComparedQuantity("timing.peak_rss_mb", "peak memory [MiB]", plain),
-)
+    "map.le90_area_m", "map.completeness_area", "trajectory.final.ate_rmse_m", "trajectory.f2f.ate_rmse_m",
+    "trajectory.online.ate_rmse_m", "trajectory.final.ate_max_m", "trajectory.final.z_rmse_m",
+    "trajectory.final.heading_rmse_deg", "consistency.nees_position_mean", "map.le90_m", "map.nmad_m",
+    "map.completeness", "orthomosaic.ce90_px", "control.cross_track_rmse_m", "self_check.frames_lost", "timing.frames",
+    "timing.keyframes", "timing.wall_s", "timing.peak_rss_mb",
+)  # fmt: skip
+#: Those of which neither smaller nor larger values are better.
+NEUTRAL = ("consistency.nees_position_mean", "timing.frames", "timing.keyframes")
 
 
 class Cell(NamedTuple):
@@ -75,7 +58,7 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    quantity: ComparedQuantity
+    name: str  #: of the metric, dotted
     cells: list[Cell]
 
 
@@ -104,31 +87,21 @@ def names_of(runs: Sequence[Run]) -> list[str]:
 
 def table(runs: Sequence[Run]) -> list[Row]:
     """Returns the rows of all quantities that at least one run has."""
-    rows: list[Row] = []
     numbers = [numbers_of(run.metrics or {}) for run in runs]
-    for quantity in QUANTITIES:
-        first, *others = [one.get(quantity.name) for one in numbers]
-        if any(value is not None for value in (first, *others)):
-            start = Cell(first, quantity.text(first))
-            rows.append(Row(quantity, [start, *(_compared(quantity, value, first) for value in others)]))
-    return rows
+    values = {name: [one.get(name) for one in numbers] for name in QUANTITIES}
+    return [
+        Row(name, [_compared(name, value, found[0] if k else None) for k, value in enumerate(found)])
+        for name, found in values.items()
+        if any(value is not None for value in found)
+    ]
 
 
 def scenario_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
     """Returns the keys of the scenario in which the runs differ, with the value in every run as JSON, or a dash."""
-    flat = [dict(leaves(run.scenario)) for run in runs]
+    flat = [dict(_leaves(run.scenario)) for run in runs]
     keys = sorted(set().union(*flat))
     texts = {key: [_json(one[key]) if key in one else DASH for one in flat] for key in keys}
     return {key: values for key, values in texts.items() if len(set(values)) > 1}
-
-
-def notes(differences: Mapping[str, Sequence[str]]) -> list[str]:
-    """Returns sentences on the limits of a comparison with these `scenario_differences`."""
-    survey = [key for key in differences if key.split(".")[0] in ("seed", "terrain", "objects", "plan")]
-    sentences = ["A difference between two surveys is partly due to chance; twin study compares many seeds."]
-    if survey:
-        sentences.insert(0, f"The runs are surveys of different floors or plans: {', '.join(survey)}.")
-    return sentences
 
 
 def as_json(runs: Sequence[Run]) -> dict[str, Any]:
@@ -140,7 +113,7 @@ def as_json(runs: Sequence[Run]) -> dict[str, Any]:
             for name, run, one in zip(names_of(runs), runs, metrics, strict=True)
         ],
         "metrics": {
-            row.quantity.name: {
+            row.name: {
                 "values": [cell.value for cell in row.cells],
                 "differences": [cell.difference for cell in row.cells],
             }
@@ -153,9 +126,7 @@ def as_json(runs: Sequence[Run]) -> dict[str, Any]:
 def text_rows(runs: Sequence[Run]) -> list[tuple[str, ...]]:
     """Returns the table as text: names of the runs, their statuses, and one row per quantity with the differences."""
     statuses = [str((run.metrics or {}).get("status")) for run in runs]
-    rows = [
-        (row.quantity.label, *(f"{cell.text}  {cell.change}".rstrip() for cell in row.cells)) for row in table(runs)
-    ]
+    rows = [(words(row.name), *(f"{cell.text}  {cell.change}".rstrip() for cell in row.cells)) for row in table(runs)]
     return [("", *names_of(runs)), ("status", *statuses), *rows]
 
 
@@ -168,11 +139,12 @@ def render(runs: Sequence[Run]) -> str:
         "badges": [badge(run.metrics) for run in runs],
         "first_lines": [first_lines(run.metrics or {}) for run in runs],
         "rows": table(runs),
-        "notes": notes(differences),
         "differences": differences,
+        "other_surveys": [key for key in differences if key.split(".")[0] in _OF_SURVEY],
         "figures": draw_comparison(runs, names),
     }
-    return render_page("twin.report", "comparison.html.j2", variables)
+    answer = {"paragraphs": render_paragraphs("comparison_answer.txt.j2", variables, "twin.report")}
+    return render_page("twin.report", "comparison.html.j2", variables | answer)
 
 
 def draw_comparison(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
@@ -242,20 +214,30 @@ def height_error_curves(runs: Styled) -> Figure | None:
     return figure
 
 
-def _compared(quantity: ComparedQuantity, value: float | None, first: float | None) -> Cell:
-    text = quantity.text(value)
+def _compared(name: str, value: float | None, first: float | None) -> Cell:
+    text = metric_value(name, value)
     if value is None or first is None:
         return Cell(value, text)
     difference = value - first
     if difference == 0:
         return Cell(value, text, difference, "same")
-    better = {"less": difference < 0, "more": difference > 0}.get(quantity.better)
-    level = "" if better is None else "good" if better else "bad"
-    change = f"{'+' if difference > 0 else '-'}{quantity.text(abs(difference))}"
-    if quantity.text is not percent and first > 0:
+    level = "" if name in NEUTRAL else "good" if (difference > 0) == more_is_better(name) else "bad"
+    if is_fraction(name):
+        return Cell(value, text, difference, f"{100 * difference:+.2g} %", level)
+    change = f"{'+' if difference > 0 else '-'}{metric_value(name, abs(difference))}"
+    if first > 0:
         factor = value / first
         change += f" ({100 * (factor - 1):+.0f} %)" if factor < 3 else f" ({ratio(factor)})"
     return Cell(value, text, difference, change, level)
+
+
+def _leaves(scenario: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yields dotted keys and values of a scenario, of elements of a list of tables by their numbers."""
+    for key, value in leaves(scenario):
+        if isinstance(value, list) and value and isinstance(value[0], Mapping):
+            yield from _leaves({key: {str(k): one for k, one in enumerate(value)}})
+        else:
+            yield key, value
 
 
 def _json(value: Any) -> str:
