@@ -8,10 +8,11 @@ from study_surveys import STUDY, SerialEngine, fly, study_of
 
 from twin.app import study_command
 from twin.errors import TwinError
+from twin.report.number_formats import duration
 from twin.studies import progress, runner, sentences
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress, study_progress
-from twin.studies.run_time import duration, parsed_duration, rendered_time
+from twin.studies.run_time import parsed_duration, rendered_time
 
 
 @pytest.fixture(autouse=True)

@@ -57,8 +57,8 @@ def test_a_study_without_sampled_keys_is_flown_in_one_condition(tmp_path):
 )
 def test_pages_name_rig_idealisations_and_sea_trial(tmp_path, line, sentence):
     lines = condition_lines(study_of(tmp_path, line))
-    assert lines[0] == "Rig: machine-vision pair, dome ports."
+    assert lines[0] == "Cameras: machine-vision pair, dome ports."
     ideal = [text for text in lines if "no marine snow" in text]
     assert len(ideal) == (line != "sea_trial = true\n")
     assert all(text.startswith("In the search: ") == (line == SEARCH) for text in ideal)
-    assert sentence in lines[-1] and ("snow.density_per_m3 = 0.0 to 200.0" in lines[-1]) == bool(line)
+    assert sentence in lines[-1] and ("marine snow 0 to 200 per m3" in lines[-1]) == bool(line)

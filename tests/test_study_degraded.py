@@ -113,7 +113,7 @@ def test_the_plans_of_a_search_are_listed_with_the_completeness(tmp_path):
     assert candidate.completeness == (("map.completeness_area", pytest.approx(0.97)),)
     result = TuningResult(study, [candidate], [candidate], [], None, candidate, None, "", None, False, False, False, {})
     tuning_report.write_tuning_report(result, tmp_path)
-    assert "<th>map completeness (asked area)</th>" in (tmp_path / "tuning.html").read_text()
+    assert "<th>mapped part of the asked area</th>" in (tmp_path / "tuning.html").read_text()
 
 
 def test_completeness_is_unknown_without_a_completed_survey(tmp_path):

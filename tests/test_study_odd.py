@@ -18,20 +18,28 @@ def _no_report(monkeypatch):
     [
         ("all refused", 2, ["not allowed (allowed: greater than 0) in sample 0 and 239 more"]),
         ("no survey can be planned", 2, ["No survey could be evaluated. 8 samples (8 surveys) cannot be flown"]),
-        ("half refused", 0, ["120 of 120 surveys", "120 samples (120 surveys) cannot be flown and are not counted"]),
+        (
+            "half refused",
+            0,
+            ["120 of 120 simulated surveys", "120 samples (120 surveys) cannot be flown and are not counted"],
+        ),
         (
             "non-monotonic",
             1,
             [
                 "The required 90 % is not met.",
-                "pass at plan.altitude_m 1.64 to 1.86 and 2.54 to 3; fewer pass at 1 to 1.6 and 1.9 to 2.5;",
+                "pass at height above the reference plane 1.64 to 1.86 and 2.54 to 3 m; fewer pass at 1 to 1.6",
             ],
         ),
         ("one sample", 0, ["(95 % confidence interval: 20.7 % to 100 %)", "not decided with 1 survey (about 34 more"]),
-        ("zero passes", 1, ["0 % (95 % confidence interval: 0 % to 24.2 %)", "fewer pass at 1.08 to 2.89."]),
-        ("all pass", 0, ["(95 % confidence interval: 98.4 % to 100 %)", "plan.altitude_m 1.01 to 2.99."]),
-        ("constant parameter", 0, ["plan.altitude_m has one value only."]),
-        ("categorical parameter", 1, ["pass at water.jerlov IB; fewer pass at II and III."]),
+        ("zero passes", 1, ["0 % (95 % confidence interval: 0 % to 24.2 %)", "fewer pass at 1.08 to 2.89 m."]),
+        (
+            "all pass",
+            0,
+            ["(95 % confidence interval: 98.4 % to 100 %)", "height above the reference plane 1.01 to 2.99 m."],
+        ),
+        ("constant parameter", 0, ["height above the reference plane has one value only."]),
+        ("categorical parameter", 1, ["pass at water type (Jerlov) IB; fewer pass at II and III."]),
         (
             "duplicated values",
             0,

@@ -13,6 +13,7 @@ from twin.errors import ScenarioError, UnmodelledError
 from twin.studies import flight, sentences
 from twin.studies.analysis import StudyAnalysis, mask_numbers
 from twin.studies.flight import row_of
+from twin.studies.influence import influences
 from twin.studies.report import summary as summary_of
 from twin.studies.report import write_report
 from twin.studies.results_log import ResultsLog
@@ -38,11 +39,12 @@ def analysis(study, tmp_path):
     return analyse(study, tmp_path)
 
 
-def test_the_first_sentence_states_where_the_seek_key_passes(tmp_path):
+def test_the_first_sentences_state_up_to_where_the_seek_key_passes(tmp_path):
     study = study_of(tmp_path, STUDY, ("samples = 12", "samples = 200"))
     analysis = analyse(study, tmp_path)
-    first = sentences.headline(analysis).partition(". ")[0]
-    assert first.startswith("At least 80 % of surveys pass at water.turbidity 1 to ")
+    first, second, *_ = sentences.headline(analysis).split(". ")
+    assert first.startswith("The limit of turbidity, below which 80 % pass, is 1") and " (95 % interval: 1" in first
+    assert second.startswith("At least 80 % of surveys pass at turbidity 1 to ")
     passes, *_, fails = analysis.answers["water.turbidity"]
     assert (passes.verdict, fails.verdict) == ("passes", "fails")
     assert 10 < passes.high < 20 < fails.high  # 0.001 turbidity x altitude / 2 m = 0.02 m, for altitudes 1.6 to 2.4 m
@@ -50,16 +52,36 @@ def test_the_first_sentence_states_where_the_seek_key_passes(tmp_path):
 
 
 def test_the_first_screen_answers_in_one_sentence_of_everyday_words(study, analysis):
-    text, share = sentences.answer(analysis), analysis.pass_probability
-    numbers = f"about {100 * share.value:.0f} (between {100 * share.low:.0f} and {100 * share.high:.0f})"
-    assert text.startswith(f"Of 100 such surveys, {numbers} are completed and keep ") and text.count(". ") == 0
+    answer, *others = sentences.paragraphs(analysis)
+    target = "height error on 90 % of the mapped cells (LE90) at most 2.0 cm"
+    assert answer.text.endswith(f". {analysis.passed.sum()} of 64 simulated surveys reached the target: {target}.")
+    titles = ["How sure is it?", "What changes it most?", "What does it assume?", "What does it say nothing about?"]
+    assert [paragraph.title for paragraph in others] == titles
+    share = analysis.pass_probability
+    numbers = f"about {100 * share.value:.0f} (between {100 * share.low:.0f} and {100 * share.high:.0f}) pass"
+    assert others[0].items[0].startswith(f"Of 100 such surveys, {numbers}: the pass probability is ")
+    ranges = (
+        "turbidity 1 to 40; height above the reference plane 1.6 to 2.4 m; water type (Jerlov) IB, III; daylight 0 to"
+    )
+    assert f"Values beyond those that were varied: {ranges} 20 lx." in others[3].items[0]
+
+
+def test_what_changes_the_result_most_is_told_by_the_surveys_at_its_ends(study, analysis):
+    largest = influences(analysis)[0]
+    assert largest.key == "water.turbidity" and [end.passed for end in largest.ends] == [1.0, 0.0]
+    turbidity = np.sort(analysis.numbers("vary.water.turbidity"))
+    median = np.median(analysis.numbers("map.le90_m")[analysis.numbers("vary.water.turbidity") <= turbidity[6]])
+    assert largest.ends[0].median == pytest.approx(median, rel=0.2) and largest.ends[1].median is None  # all aborted
+    line = sentences.paragraphs(analysis)[2].items[0]
+    assert line.startswith("Turbidity: at 1.0") and "100 % pass, median height error on 90 % of the mapped" in line
+    assert line.endswith(" 0 % pass.")
 
 
 def test_the_pass_probability_includes_aborted_surveys(study, analysis):
     turbid = [turbidity > 25 for turbidity in analysis.rows["vary.water.turbidity"].to_pylist()]
     assert (analysis.status == "aborted").tolist() == turbid
     assert analysis.pass_probability.value == analysis.passed.mean()
-    assert f"{analysis.passed.sum()} of 64 surveys were completed" in sentences.headline(analysis)
+    assert f"{analysis.passed.sum()} of 64 simulated surveys reached" in sentences.headline(analysis)
 
 
 def test_failed_surveys_are_unknown_results(tmp_path):
@@ -112,9 +134,10 @@ def test_a_single_failed_survey_is_singular(tmp_path):
     study = study_of(tmp_path)
     rest = analyse(study, tmp_path, lambda survey: fail(survey) if survey.sample == 3 else fly(survey))
     headline = sentences.headline(rest)
-    assert headline.endswith(
+    failed = (
         "1 survey failed because of the computer or the program, so its result is unknown; --resume flies it again."
     )
+    assert failed in headline
 
 
 def test_warnings_of_repeated_surveys_count_once(tmp_path):
@@ -126,13 +149,13 @@ def test_warnings_of_repeated_surveys_count_once(tmp_path):
     study = study_of(tmp_path, STUDY, *grid, ("{ uniform = [1.6, 2.4] }", "{ grid = [1.8, 2.2] }"))
     warned = analyse(study, tmp_path, lambda survey: fly(survey) | {"warning": "too turbid"})
     assert (len(warned.rows), warned.duplicate.sum(), warned.warning_counts) == (12, 4, {"too turbid": 8})
-    assert sentences.headline(warned).endswith("Warning in 8 of 8 surveys: too turbid.")
+    assert sentences.headline(warned).endswith("Warnings: in 8 of 8 surveys: too turbid.")
 
 
 def test_warnings_are_counted_and_the_first_one_is_shown(tmp_path):
     study = study_of(tmp_path)
     warned = analyse(study, tmp_path, lambda s: fly(s) | {"warning": "surrogate: too turbid" if s.sample < 3 else ""})
-    assert sentences.headline(warned).endswith("Warning in 3 of 12 surveys: surrogate: too turbid.")
+    assert sentences.headline(warned).endswith("Warnings: in 3 of 12 surveys: surrogate: too turbid.")
 
 
 def test_without_warnings_the_headline_has_none(study, analysis):
@@ -231,9 +254,9 @@ def test_the_page_is_self_contained_and_begins_with_the_result(tmp_path):
     write_report(analysis, tmp_path / "study.html")
     page = (tmp_path / "study.html").read_text()
     assert "How &lt;turbid&gt; may it be?" in page
-    assert page.index("of surveys pass") < page.index(sentences.answer(analysis)) < page.index("<main>")
+    assert page.index("of surveys pass") < page.index("surveys reached the target") < page.index("<main>")
     titles = (
-        "Pass probability by key",
+        "Pass probability by what was varied",
         "Where the required fraction of surveys passes",
         "Metrics of the surveys",
         "Sensitivity",

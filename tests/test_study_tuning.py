@@ -99,9 +99,9 @@ def test_the_recommended_scenario_reads_back_with_the_chosen_values(searched):
     assert scenario.estimate.node_stride == result.recommended.values["estimate.node_stride"]
     assert scenario.water == load_scenario("reef").water
     page = (folder / "tuning.html").read_text()
-    flown = r"Fly 1\.9\d m above the reference plane at 0\.35 m/s, legs [\d.]+ c?m apart \([\d.]+ min, one dive\): "
+    flown = r"Fly 1\.9\d m above the reference plane z = 0 \(1\.[34]\d m to 1\.[78]\d m above the floor\) at 0\.35 m/s"
     assert re.search(flown, page)
-    assert page.index("In the scenario: plan.altitude_m = 1.9") < page.index("<img")
+    assert page.index("In the scenario: <code>plan.altitude_m</code> = 1.9") < page.index("<img")
     assert (folder / "pareto.png").stat().st_size > 5000
 
 
@@ -231,7 +231,10 @@ def test_no_plan_is_recommended_if_none_is_feasible(searched, tmp_path):
     study, *_ = searched
     result = search(study, tmp_path / "out", function=abort)
     assert (result.recommended, result.scenario, result.finalists) == (None, None, [])
-    assert tuning_report.headline(result).startswith("No plan is recommended: 24 plans were evaluated")
+    assert tuning_report.headline(result).startswith(
+        "No plan is recommended: none reached the target in 90 % of surveys"
+    )
+    assert "24 plans were searched." in tuning_report.headline(result)
     tuning_report.write_tuning_report(result, tmp_path / "out")
     assert not (tmp_path / "out" / "recommended.toml").exists()
 

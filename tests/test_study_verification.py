@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -170,16 +171,22 @@ def test_the_table_distinguishes_rendered_from_surrogate_surveys(searched):
 def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(searched):
     _, result, folder = searched
     headline = tuning_report.headline(result)
-    assert "6 of 6 rendered surveys passed; with 95 % confidence at least 54.1 % pass, 50 % required" in headline
-    limits = "noise of the stereo matching 4.0 mm (64 %), errors of the camera poses 3.0 mm (36 %)"
-    assert f"What limits its heights: {limits} of their stated variance." in headline
-    assert "passes if it is complete with map height error (LE90) at most 1.0 cm. Beyond the conditions" in headline
+    target = "height error on 90 % of the mapped cells (LE90) at most 1.0 cm"
+    assert f"6 of 6 simulated surveys with rendered images reached the target: {target}." in headline.splitlines()[0]
+    assert "images): with 95 % confidence at least 54.1 % pass, 50 % required." in headline
+    limits = headline.partition("What limits it, and what reduces that? ")[2]
+    assert limits.startswith("Noise of the stereo matching (contrast, ") and "stated as 4.0 mm, 64 % of the" in limits
+    assert "Errors of the camera poses, stated as 3.0 mm, 36 % of the variance. Less with more sidelap" in limits
+    assert f"if it reaches its end, no check of the estimators fails, and it keeps the target: {target}." in headline
+    assert "only turbidity 5 to 6 was varied. Beyond that" in headline
     median = result.verification(result.recommended).medians["map.le90_m"]
     assert f"{1e3 * median[1]:.1f} mm ({1e3 * median[0]:.1f} mm)" in headline.replace("1.0 cm", "10.0 mm")
     tuning_report.write_tuning_report(result, folder)
     warnings = tuning_report.warnings(result)
     assert any("the surrogate extrapolates to" in text for text in warnings)
-    assert any("the surrogate is wrong about the map height error (LE90)" in text for text in warnings)
+    assert any(
+        "the surrogate is wrong about the height error on 90 % of the mapped cells (LE90)" in text for text in warnings
+    )
     summary = tuning_report.summary(result)
     assert json.loads(json.dumps(summary, allow_nan=False))["warnings"] == warnings
     assert summary["recommended"]["shown"]
@@ -188,7 +195,10 @@ def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(sea
         assert f"# Warning: {text}" in scenario
     assert page.count("<b>Warning:</b>") == len(warnings)
     assert "Plans with rendered surveys" in page
-    assert page.index("starting plan") < page.index("map.<wbr>le90_<wbr>m (3 of 3)") < page.index("<img")
+    assert page.index("starting plan") < page.index("mapped cells (LE90) (3 of 3)") < page.index("<img")
+    assert '<span title="plan.altitude_m">height above the reference plane</span>' in page
+    keys = re.sub(r"<code>.*?</code>|<pre>.*?</pre>|title=\".*?\"|data:image.*?\"", "", page, flags=re.DOTALL)
+    assert "plan.altitude_m" not in keys and "map.le90_m" not in keys  # in words
 
 
 def test_if_no_plan_passes_rendered_nothing_is_recommended_after_the_stated_rounds(tmp_path):
@@ -198,7 +208,8 @@ def test_if_no_plan_passes_rendered_nothing_is_recommended_after_the_stated_roun
     assert {v.search_round for v in result.verifications} <= {0, 1, 2}
     assert 1 <= len(result.verifications) <= 9
     headline = tuning_report.headline(result)
-    assert "none is shown to reach 50 % in rendered surveys" in headline and result.unproven is None
+    assert "at most 1.0 cm; 0 of " in headline and result.unproven is None
+    assert "widen [tune.search] towards lower altitude" in headline
     assert tuning_report.summary(result)["recommended"] is None
 
 
@@ -240,8 +251,11 @@ def test_a_plan_that_too_few_rendered_surveys_show_is_not_recommended_but_named(
     assert result.recommended is None and result.unproven is not None
     assert sum(v.surveys for v in result.verifications) == flown
     headline = tuning_report.headline(result)
-    assert headline.startswith("No plan is recommended: none is shown to reach 50 % in rendered surveys. The closest")
-    assert ("4 of 4 rendered surveys passed; 50 % is not shown: lower bound 39.8 %" in headline) == (flown > 0)
+    assert headline.startswith(
+        "No plan is recommended: none is shown to reach the target in 50 % of rendered surveys: "
+    )
+    assert "at most 1.0 cm. The closest one: Fly " in headline
+    assert ("4 of 4 rendered surveys passed" in headline and "lower bound 39.8 %" in headline) == (flown > 0)
     assert ("6 are needed if none fails" in headline) == (flown > 0)
     if flown:
         tuning_report.write_tuning_report(result, tmp_path / "out")

@@ -15,13 +15,14 @@ from twin.core.output_folder import sole_writer
 from twin.engines.engine import open_engine
 from twin.errors import ScenarioError, TwinError
 from twin.planning.summary import run_time_s
+from twin.report.number_formats import duration
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.studies import agreement, rendered_check, report, sentences
 from twin.studies.conditions import in_sea_trial
 from twin.studies.progress import study_progress
 from twin.studies.rendered_check import RenderedCheck
-from twin.studies.run_time import duration, parsed_duration
+from twin.studies.run_time import parsed_duration
 from twin.studies.runner import Fleet, StudyResult, run_study
 from twin.studies.study_file import Study, load_study
 from twin.studies.surveys import samples, scenario_of_sample
@@ -158,7 +159,7 @@ def _print_result(result: StudyResult) -> None:
     for line in sentences.answer_lines(analysis):
         print(f"- {line}")
     rows = [
-        (sentences.metric_name(one.name), *(sentences.metric_interval(one.name, i) for i in (one.median, one.bound)))
+        (sentences.words(one.name), *(sentences.metric_interval(one.name, i) for i in (one.median, one.bound)))
         for one in analysis.metric_summaries
     ]
     console.print_table(f"{analysis.study.name}: median and 95 % bound of the surveys", rows)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from twin.controllers.forecast import Forecast, forecast
 from twin.core.geometry import Array
 from twin.core.quality import Energy
@@ -16,13 +18,14 @@ from twin.judge.verdict import judge_requirements
 from twin.planning.cost import ComputingCost, computing_cost
 from twin.planning.expected_error import ExpectedError, expected_error
 from twin.planning.vehicle_limits import largest_latency_s
-from twin.report.number_formats import length, percent, with_unit
+from twin.report.html import render_rows
+from twin.report.number_formats import duration, length, percent, with_unit
 from twin.world.computer import frames_of_latency
 from twin.world.energy import planned_energy
 from twin.world.floor_forecast import FloorForecast, Spread, forecast_over_floor, spread
 from twin.world.mission import Mission
 from twin.world.path_checks import unknown_share
-from twin.world.planning import SHORT_PERCENT, UNKNOWN_SLOPE
+from twin.world.planning import SHORT_PERCENT, UNKNOWN_SLOPE, planned_keyframes
 
 #: Standard deviation of the disparity on good texture [px]; the depth error on the reference plane is proportional to
 #: it.
@@ -187,73 +190,43 @@ def _limits_of_validity(mission: Mission, error: ExpectedError) -> Iterator[str]
 
 def rows(summary: PlanSummary) -> list[tuple[str, str]]:
     """Returns the properties of the plan as text: pairs (name, value with unit)."""
-    f, mission, error = summary.plane, summary.mission, summary.error
-    width_m, height_m = f.footprint_m
+    mission = summary.mission
     swath, of_track = _SWATHS[mission.scenario.plan.pattern]
-    included = "included" if mission.scenario.imaging.fidelity == "rendered" else "not included"
-    objects = f"{len(mission.objects)}, {included} in the properties over the floor"
-    n_cross, heading_deg = mission.plan.request.cross_lines, math.degrees(mission.plan.area.heading)
-    rise_m = mission.plan.request.cross_rise_m
-    higher = f", {length(rise_m)} higher" if rise_m else ""
-    return [
-        (f"tracks L, {of_track} each", f"{mission.plan.n_leg_tracks}"),
-        *([("cross lines", f"{n_cross}, flown after the {swath}s{higher}")] if n_cross else []),
-        *[("task", text) for text in _tasks(mission)],
-        ("frames per keyframe N", f"{f.n_frames_per_keyframe}"),
-        (f"keyframes per {swath} M", f"{f.keyframes_per_swath}"),
-        ("keyframes", f"{f.n_keyframes}"),
-        ("frames", f"{mission.n_frames}"),
-        ("time", f"{f.duration_s + summary.hold_s:.0f} s, of which {summary.hold_s:.0f} s station keeping"),
-        *([("energy", _energy_text(mission))] if mission.scenario.vehicle.dynamics == "rigid" else []),
-        *([("latency", summary.latency.text)] if summary.latency else []),
-        ("path", length(f.path_m)),
-        ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
-        ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {_swath_spacing(mission)} between {swath}s"),
-        *([("heading of the legs", f"{heading_deg:.0f} deg")] if heading_deg else []),
-        ("on the reference plane: footprint", f"{length(width_m)} across, {length(height_m)} along"),
-        ("on the reference plane: overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
-        ("on the reference plane: disparity", f"{f.disparity_px:.1f} px"),
-        ("water", f"{provenance_of(mission.scenario.water)}; {mission.clarity}"),
-        *([("objects", objects)] if mission.objects else []),
-        ("coverage of the area by both cameras", percent(summary.floor.coverage)),
-        (
-            "expected LE90 of the map",
-            f"{length(error.percentile_m(90))} where mapped, {percent(error.completeness)} of the view",
-        ),
-        ("simulation", _cost_text(summary.cost)),
-    ]
+    energy = planned_energy(mission) if mission.scenario.vehicle.dynamics == "rigid" else None
+    known = {
+        "summary": summary,
+        "mission": mission,
+        "swath": swath,
+        "of_track": of_track,
+        "tasks": {task.name: task for task in mission.scenario.tasks},
+        "energy": energy,
+        "dives": energy and _dives(energy),
+        "swath_spacing": _swath_spacing(mission),
+        "heading_deg": math.degrees(mission.plan.area.heading),
+        "water": provenance_of(mission.scenario.water),
+        "duration": duration,
+    }
+    return render_rows("plan_rows.txt.j2", known, "twin.planning")
 
 
 def instructions(mission: Mission) -> str:
     """Returns what to fly, e.g. "Fly 2.1 m above the floor at 0.35 m/s, legs 0.9 m apart (41 min, one dive)"."""
     plan, scenario = mission.plan, mission.scenario
-    floor = "floor" if plan.follows_floor else "reference plane"
+    height = "floor"
+    if not plan.follows_floor:
+        x, y, z = planned_keyframes(plan, scenario.plan.pattern).position_m.T
+        low_m, high_m = np.nanquantile(z - mission.chart.height_at(x, y), [0.05, 0.95])
+        height = f"reference plane z = 0 ({length(low_m)} to {length(high_m)} above the floor)"
     legs = f", {_SWATHS[scenario.plan.pattern][0]}s {_swath_spacing(mission)} apart" if plan.swath_spacing_m else ""
-    time = f"{mission.n_frames / mission.rig.frame_rate_hz / 60:.2g} min"
+    time = duration(mission.n_frames / mission.rig.frame_rate_hz)
     dives = f", {_dives(planned_energy(mission))}" if scenario.vehicle.dynamics == "rigid" else ""
-    return f"Fly {length(scenario.plan.altitude_m)} above the {floor} at {plan.speed_mps:.2g} m/s{legs} ({time}{dives})"
+    return (
+        f"Fly {length(scenario.plan.altitude_m)} above the {height} at {plan.speed_mps:.2g} m/s{legs} ({time}{dives})"
+    )
 
 
 def _dives(energy: Energy) -> str:
     return "one dive" if energy.dives == 1 else f"{energy.dives} dives"
-
-
-def _energy_text(mission: Mission) -> str:
-    vehicle, energy = mission.scenario.vehicle, planned_energy(mission)
-    return (
-        f"{energy.survey_wh:.3g} W h: {_dives(energy)} with a battery of {vehicle.battery_wh:g} W h, a fifth in reserve"
-    )
-
-
-def _tasks(mission: Mission) -> list[str]:
-    """Returns what is surveyed closely, and after which track, in words."""
-    tasks, plan = {task.name: task for task in mission.scenario.tasks}, mission.plan
-    texts = []
-    for detour in sorted(plan.detours, key=lambda detour: detour.track):
-        task, time_s = tasks[detour.name], plan.track_duration_s(detour.track)
-        size = "{:g} m x {:g} m".format(*task.size_m)
-        texts.append(f"{task.name}: {size} from {length(task.altitude_m)}, as track {detour.track}, {time_s:.0f} s")
-    return texts
 
 
 def _swath_spacing(mission: Mission) -> str:
@@ -262,13 +235,6 @@ def _swath_spacing(mission: Mission) -> str:
     if not plan.request.leg_spacing:
         return length(plan.swath_spacing_m)
     return f"{length(plan.least_spacing_m)} to {length(plan.swath_spacing_m)}"
-
-
-def _cost_text(cost: ComputingCost) -> str:
-    minutes = cost.wall_s / 60
-    time = f"{cost.wall_s:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
-    disk = f"{cost.disk_mb:.0f} MB of disk ({cost.flight_disk_mb:.0f} MB until it ends)"
-    return f"about {time} of processor time, {cost.memory_mb / 1000:.1f} GB of memory, {disk}"
 
 
 def floor_rows(summary: PlanSummary) -> list[tuple[str, ...]]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from twin.judge.map_error import INFINITE_WITH_HOLES
-from twin.report.number_formats import percent, plain
+from twin.report.number_formats import metric_value, percent, plain
+from twin.report.words import words
 from twin.studies import sentences
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.statistics import LEVEL, RESAMPLES, UNDEFINED, Array, Interval, Proportion, wilson_interval
@@ -135,7 +136,7 @@ def _ratio(numerator: Array, denominator: Array) -> Array:
 def table(result: Agreement) -> list[tuple[str, ...]]:
     return [
         (
-            sentences.metric_name(one.metric),
+            words(one.metric),
             str(one.pairs),
             _value(one.metric, one.rendered),
             _value(one.metric, one.surrogate),
@@ -158,7 +159,7 @@ def verdict_line(result: Agreement) -> str:
 def _value(metric: str, value: float) -> str:
     if np.isinf(value):
         return "infinite"
-    return sentences.metric_value(metric, value) if metric.endswith("_m") else plain(value)
+    return metric_value(metric, value) if metric.endswith("_m") else plain(value)
 
 
 def _verdict(agrees: bool) -> str:

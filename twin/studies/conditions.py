@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from twin.errors import ScenarioError
+from twin.report.words import values_in_words
 from twin.scenario.file import read_toml, read_tree
 from twin.scenario.idealisations import idealisations
 from twin.studies.distribution import Distribution
@@ -33,16 +34,24 @@ def condition_lines(study: Study) -> list[str]:
         which = "All surveys" if study.sea_trial else "The rendered surveys that verify a plan"
         search = "" if study.sea_trial else "In the search: "
         flown, (fixed, varied) = in_sea_trial(study) if study.sea_trial else study, _missing(study)
-        keys = [f"{key} = {value}" for key, value in fixed.items()]
-        keys += [f"{key} = {law.values[0]} to {law.values[-1]}" for key, law in varied.items()]
+        keys = [values_in_words(key, [value]) for key, value in fixed.items()]
+        keys += [values_in_words(key, law.bounds) for key, law in varied.items()]
         sea = f"{which} are in the conditions of a sea trial: {', '.join(keys) or 'as the study sets them'}."
     for sample in samples(flown):
         with suppress(ScenarioError):
             scenario = scenario_of_sample(flown, tree, sample)
-            rig = f"Rig: {scenario.rig.title or 'the cameras of the scenario'}."
+            rig = f"Cameras: {scenario.rig.title or 'those of the scenario'}."
             ideal = " ".join(idealisations(scenario))
             return [rig, *([search + ideal] if ideal else []), sea]
     return [sea]
+
+
+def varied_in_words(study: Study) -> list[str]:
+    """Returns each key that a study varies, with the values between which it lies, e.g. "visibility 4 to 8 m"."""
+    bounds = {key: law.bounds for key, law in study.vary.items()}
+    for table in study.together:
+        bounds |= dict(zip(table.keys, zip(*table.rows, strict=True), strict=True))
+    return [values_in_words(key, values) for key, values in bounds.items()]
 
 
 def _missing(study: Study) -> tuple[dict[str, Any], dict[str, Distribution]]:

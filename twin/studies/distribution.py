@@ -56,6 +56,13 @@ class Distribution(Section):
         return getattr(self, self.kind)
 
     @property
+    def bounds(self) -> tuple[Any, ...]:
+        """Returns low and high, of a normal distribution those of 95 %; the values of a choice or grid."""
+        if self.normal is not None:
+            return tuple(self.quantiles(np.array([0.025, 0.975])))
+        return self.values[-2:] if self.kind in _LAWS else self.values
+
+    @property
     def is_sampled(self) -> bool:
         """Returns whether values are sampled; those of a grid are enumerated instead."""
         return self.kind != "grid"

@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as ProgressBar
 
-from twin.report.number_formats import plain
+from twin.report.number_formats import duration, plain
 from twin.studies.flight import Row, has_passed
-from twin.studies.run_time import duration
 from twin.studies.statistics import wilson_interval
 
 _INTERVAL_S = 60.0  # between two lines where there is no terminal

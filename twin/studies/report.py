@@ -15,7 +15,6 @@ from twin.report.html import render_page
 from twin.report.style import FIGURE_STYLE
 from twin.studies import agreement, sentences, study_figures
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.conditions import condition_lines
 from twin.studies.statistics import RESAMPLES
 
 _MAX_REFUSED = 50  # largest number of refused samples that the report lists
@@ -30,8 +29,7 @@ def write_report(analysis: StudyAnalysis, page: Path) -> None:
         "compared": compared,
         "analysis": analysis,
         "sentences": sentences,
-        "headline": sentences.headline(analysis),
-        "conditions": condition_lines(analysis.study),
+        "paragraphs": sentences.paragraphs(analysis),
         "sensitivities": [s for s in analysis.sensitivities if np.isfinite(s.correlation.value) or s.explained > 0],
         "figures": study_figures.draw_all(analysis, compared is not None),
         "refused_samples": analysis.refused_samples[:_MAX_REFUSED],

@@ -1,4 +1,4 @@
-"""Run time of rendered surveys, expected from those flown so far, and durations as text."""
+"""Run time of rendered surveys, expected from those flown so far, and durations read from text."""
 
 import re
 from collections.abc import Iterable
@@ -26,12 +26,6 @@ def rendered_time(rows: Iterable[Row], scenario: Scenario, simulated_s: float) -
     rig = scenario.rig
     frame_s = _FRAME_S + _MEGAPIXEL_S * 1e-6 * rig.image_width_px * rig.image_height_px
     return simulated_s * rig.frame_rate_hz * frame_s, "a rough estimate"
-
-
-def duration(time_s: float) -> str:
-    if time_s < 90:
-        return f"{time_s:.0f} s"
-    return f"{time_s / 60:.0f} min" if time_s < 5400 else f"{time_s / 3600:.1f} h"
 
 
 def parsed_duration(text: str, option: str) -> float:

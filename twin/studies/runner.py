@@ -14,13 +14,14 @@ from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
 from twin.engines.engine import Engine
 from twin.engines.worker import OUT_OF_TIME, Outcome, TaskLimits
 from twin.errors import EngineLostError, TwinError
+from twin.report.number_formats import duration
 from twin.scenario.file import input_files
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import Row, fly, refused_row, row_of
 from twin.studies.progress import StudyProgress
 from twin.studies.report import write_agreement, write_report
 from twin.studies.results_log import JOURNAL_FILE, ResultsLog, key_of, write_parquet
-from twin.studies.run_time import duration, rendered_time
+from twin.studies.run_time import rendered_time
 from twin.studies.study_file import FIDELITY, Study
 from twin.studies.surveys import Survey, refusals, rendered, samples, seeds_of_sample, survey_keys, surveys
 

@@ -1,52 +1,25 @@
 """Text of the study report: metrics, confidence intervals, and the sentences that summarise the results."""
 
+import sys
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.judge.verdict import more_is_better
-from twin.report.number_formats import DASH, length, percent, with_unit
+from twin.report.html import Paragraph, lines_of, render_paragraphs
+from twin.report.number_formats import DASH, metric_value, percent, unit_of
+from twin.report.words import words
 from twin.studies.analysis import StudyAnalysis, count_similar
 from twin.studies.answers import Answer, KeyLimit, rounded
+from twin.studies.conditions import condition_lines, varied_in_words
+from twin.studies.influence import influences
 from twin.studies.statistics import LEVEL, Interval, Proportion
 from twin.studies.study_file import Study
 
-_METRIC_NAMES = {
-    "trajectory.final.ate_rmse_m": "final trajectory error (ATE, RMSE)",
-    "trajectory.online.ate_rmse_m": "online trajectory error (ATE, RMSE)",
-    "map.le90_m": "map height error (LE90)",
-    "map.completeness": "map completeness (observed floor)",
-    "map.le90_area_m": "map height error over the asked area (LE90)",
-    "map.completeness_area": "map completeness (asked area)",
-    "map.rmse_m": "map height error (RMSE)",
-    "map.sigma_ratio": "sigma ratio of the map (RMS of error / sigma)",
-    "self_check.sigma_max_m": "largest standard deviation of a position",
-    "map.nmad_m": "map height error (NMAD)",
-    "timing.simulated_s": "survey duration",
-    "vision.points_median": "matched points (median)",
-    "vision.points_p10": "matched points (10th percentile)",
-    "vision.contrast_median": "image contrast (median)",
-    "risk": "risk (fraction not passed)",
-}
-
-
-def metric_name(metric: str) -> str:
-    return _METRIC_NAMES.get(metric, metric)
-
 
 def metric_heading(metric: str) -> str:
-    name = metric_name(metric)
-    return name[:1].upper() + name[1:]
-
-
-def metric_value(metric: str, value: float | None) -> str:
-    """Returns the value of a metric with its unit; `risk` in percent; a dash for None, NaN and infinity."""
-    if metric == "risk":
-        return percent(value)
-    if value is None or not np.isfinite(value):
-        return DASH
-    return length(value) if metric.endswith("_m") else with_unit(metric, float(value))
+    return words(metric)[:1].upper() + words(metric)[1:]
 
 
 def metric_interval(metric: str, interval: Interval) -> str:
@@ -80,45 +53,36 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
-def answer(analysis: StudyAnalysis) -> str:
-    """Returns what a study found in one sentence without terms of statistics; "" without an evaluated survey."""
-    if not analysis.evaluated.any():
-        return ""
-    share, required = analysis.pass_probability, analysis.required_probability
-    of_100 = f"about {100 * share.value:.0f} (between {100 * share.low:.0f} and {100 * share.high:.0f})"
-    wanted = f", where {100 * required:g} are required" if required is not None else ""
-    kept = " and ".join(limits_in_words(analysis.limits))
-    return f"Of 100 such surveys, {of_100} are completed{f' and keep {kept}' if kept else ''}{wanted}."
-
-
 def limits_in_words(limits: Mapping[str, float]) -> list[str]:
     return [
-        f"{metric_name(metric)} {'at least' if more_is_better(metric) else 'at most'} {metric_value(metric, limit)}"
+        f"{words(metric)} {'at least' if more_is_better(metric) else 'at most'} {metric_value(metric, limit)}"
         for metric, limit in limits.items()
     ]
 
 
+def paragraphs(analysis: StudyAnalysis) -> list[Paragraph]:
+    """Returns what a study answers, how sure it is, what changes it most, what it assumes and what it does not say."""
+    study, different = analysis.study, analysis.warning[~analysis.duplicate]
+    known = {
+        "analysis": analysis,
+        "study": study,
+        "n": int(analysis.evaluated.sum()),
+        "limits": limits_in_words(analysis.limits),
+        "seek": answer_lines(analysis, [study.seek] if study.seek else []),
+        "verdict": requirement_verdict(analysis),
+        "refused": _refusals(analysis, analysis.refused & ~analysis.unmodelled),
+        "unmodelled": _refusals(analysis, analysis.unmodelled),
+        "n_warned": f"{int((different != '').sum())} of {len(different)}",
+        "influences": influences(analysis)[:2],
+        "varied": varied_in_words(study),
+        "conditions": condition_lines(study),
+        "sentences": sys.modules[__name__],
+    }
+    return render_paragraphs("study_answer.txt.j2", known, "twin.studies")
+
+
 def headline(analysis: StudyAnalysis) -> str:
-    """Returns the main results of a study as text; without an evaluated survey, only which surveys are not counted."""
-    n, study = int(analysis.evaluated.sum()), analysis.study
-    left_out = [*_refused(analysis), *_duplicates(analysis), *_failed(analysis)]
-    if n_left := analysis.not_flown:
-        left_out.append(f"The study is not finished: {counted(n_left, 'survey')} not flown yet; --resume continues it.")
-    if n == 0:
-        return " ".join(["No survey could be evaluated.", *left_out])
-    limits = limits_in_words(analysis.limits)
-    completed = "were completed" + (" with " + " and ".join(limits) if limits else "")
-    result = (
-        f"The pass probability is {confidence(analysis.pass_probability)}: "
-        f"{int(analysis.passed.sum())} of {n} surveys {completed}."
-    )
-    answers = answer_lines(analysis, [study.seek] if study.seek else [])
-    reasons = [] if analysis.passed.any() else analysis.failure_reasons[:1]
-    conclusions = [*_requirement(analysis), *(f"The most frequent reason: {one.reason}." for one in reasons)]
-    different, warnings = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)[:1]
-    n_warned = int((different != "").sum())
-    warned = [f"Warning in {n_warned} of {len(different)} surveys: {text.rstrip('.')}." for text in warnings]
-    return " ".join([*answers, result, *conclusions, *left_out, *warned])
+    return lines_of(paragraphs(analysis))
 
 
 def answer_lines(analysis: StudyAnalysis, keys: Sequence[str] | None = None) -> list[str]:
@@ -126,30 +90,24 @@ def answer_lines(analysis: StudyAnalysis, keys: Sequence[str] | None = None) -> 
     required, limits = analysis.required_probability, analysis.key_limits
     idle = {key for key, regression in analysis.regressions.items() if not regression.worst}
     return [
-        " ".join(
-            [
-                *([f"No influence of {key} is shown."] if key in idle else []),
-                answer_sentence(key, answers, required),
-                *limit_sentences(limits.get(key), required),
-            ]
-        )
+        (f"No influence of {words(key)} is shown. " if key in idle else limit_sentence(key, limits.get(key), required))
+        + answer_sentence(key, answers, required)
         for key, answers in analysis.answers.items()
         if keys is None or key in keys
     ]
 
 
-def limit_sentences(limit: KeyLimit | None, required: float | None) -> list[str]:
-    """Returns a sentence on the limit of a key, if it has one, with its confidence interval."""
+def limit_sentence(key: str, limit: KeyLimit | None, required: float | None) -> str:
+    """Returns a sentence on the limit of a key with its confidence interval, and a space; "" if it has none."""
     if limit is None or (np.isinf(limit.low) and np.isinf(limit.high)):
-        return []
-    ends = (limit.low, limit.high)
-    if np.isfinite(ends).all():
+        return ""
+    if np.isfinite([limit.low, limit.high]).all():
         interval = f"{rounded(limit.low)} to {rounded(limit.high)}"
     else:
         interval = f"below {rounded(limit.high)}" if np.isfinite(limit.high) else f"above {rounded(limit.low)}"
-    value = f"is {rounded(limit.value)}, with" if np.isfinite(limit.value) else "lies in"
-    side = "above" if limit.rises else "below"
-    return [f"The limit, {side} which {percent(required)} pass, {value} the {percent(LEVEL)} interval {interval}."]
+    value = f"is {rounded(limit.value)}{unit_text(key)}" if np.isfinite(limit.value) else "is not known"
+    named = f"The limit of {words(key)}, {'above' if limit.rises else 'below'} which {percent(required)} pass, {value}"
+    return f"{named} ({percent(LEVEL)} interval: {interval}). "
 
 
 def answer_sentence(key: str, answers: list[Answer], required: float | None) -> str:
@@ -157,21 +115,26 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     passes, fails, undecided = (
         [answer for answer in answers if answer.verdict == verdict] for verdict in ("passes", "fails", "undecided")
     )
-    constant = f"{key} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
+    name, unit = words(key), unit_text(key)
+    constant = f"{name} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
     fraction = f"at least {percent(required)} of surveys pass"
-    parts = [f"no value of {key} is known at which {fraction}"]
+    parts = [f"no value of {name} is known at which {fraction}"]
     if passes:
-        parts = [f"{fraction} at {key} {_labels(passes)}"]
+        parts = [f"{fraction} at {name} {_labels(passes)}{unit}"]
     if fails:
-        parts.append(f"fewer pass at {_labels(fails)}")
+        parts.append(f"fewer pass at {_labels(fails)}{unit}")
     if undecided:
         n, verb = sum(answer.surveys for answer in undecided), "is" if len(undecided) == 1 else "are"
         unknown = sum(answer.unknown for answer in undecided)
         of_them = f", {unknown} of them unknown" if unknown else ""
         more = more_needed(undecided)
-        parts.append(f"{_labels(undecided)} {verb} not decided with {counted(n, 'survey')}{of_them} ({more})")
+        parts.append(f"{_labels(undecided)}{unit} {verb} not decided with {counted(n, 'survey')}{of_them} ({more})")
     text = "; ".join(parts) + "."
     return constant + text[:1].upper() + text[1:]
+
+
+def unit_text(key: str) -> str:
+    return f" {unit_of(key)}".rstrip()
 
 
 def _labels(answers: list[Answer]) -> str:
@@ -208,60 +171,13 @@ def requirement_verdict(analysis: StudyAnalysis) -> str:
     return "not decided" if is_possible else "not met"
 
 
-# Each of the following functions returns sentences of the headline, none if there is nothing to say.
-
-
-def _requirement(analysis: StudyAnalysis) -> list[str]:
-    required, passing = analysis.required_probability, analysis.pass_probability
-    if required is None:
-        return []
-    verdict = requirement_verdict(analysis)
-    conclusive = passing.high < required or passing.low >= required or verdict == "not decided"
-    doubt = "" if conclusive else ", but the confidence interval includes the required value (more surveys are needed)"
-    where = " over all values of the varied keys" if analysis.study.seek is not None else ""
-    return [f"The required {percent(required)} is {verdict}{where}{doubt}."]
-
-
-def _refused(analysis: StudyAnalysis) -> list[str]:
-    sentences = []
-    if (refused := analysis.refused & ~analysis.unmodelled).any():
-        n, verb, reason = _refusals(analysis, refused)
-        sentences.append(f"{n} cannot be flown and {verb} not counted, e.g.: {reason}.")
-    if analysis.unmodelled.any():
-        n, verb, reason = _refusals(analysis, analysis.unmodelled)
-        sentences.append(
-            f"{n} {verb} unknown, because the surrogate cannot simulate them: they count as not passed at the lower "
-            "bound and as passed at the upper bound of the confidence intervals; --render-refused flies them rendered; "
-            f"e.g.: {reason}."
-        )
-    if n := analysis.n_rendered:
-        sentences.append(f"{counted(n, 'survey')} that the surrogate refuses {'is' if n == 1 else 'are'} rendered.")
-    return sentences
-
-
-def _refusals(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> tuple[str, str, str]:
-    """Returns numbers of samples and surveys among the chosen ones (n,), verb, and most frequent reason."""
+def _refusals(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> tuple[str, str, str] | None:
+    """Returns numbers of samples and surveys among the chosen ones (n,), verb, and most frequent reason, if any."""
+    if not chosen.any():
+        return None
     n = len(np.unique(analysis.numbers("sample")[chosen]))
     count = f"{counted(n, 'sample')} ({counted(int(chosen.sum()), 'survey')})"
     return count, "is" if n == 1 else "are", next(iter(count_similar(analysis.reason[chosen])))
-
-
-def _duplicates(analysis: StudyAnalysis) -> list[str]:
-    n = int(analysis.duplicate.sum())
-    repeat, verb = ("repeats another one", "is") if n == 1 else ("repeat others", "are")
-    return [f"{counted(n, 'survey')} {repeat} (same scenario, same seed) and {verb} not counted again."] if n else []
-
-
-def _failed(analysis: StudyAnalysis) -> list[str]:
-    n = int(analysis.failed.sum())
-    if not n:
-        return []
-    subject, result, again = (
-        ("1 survey", "its result is", "it") if n == 1 else (f"{n} surveys", "their results are", "them")
-    )
-    return [
-        f"{subject} failed because of the computer or the program, so {result} unknown; --resume flies {again} again."
-    ]
 
 
 def seeds_note(study: Study) -> str:

@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from twin.report.number_formats import percent
+from twin.report.number_formats import metric_value, percent
 from twin.report.plotting import WIDTH_IN, log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.report.words import label, words
 from twin.studies import agreement, statistics
 from twin.studies.analysis import Mask, MetricSummary, Sensitivity, StudyAnalysis
 from twin.studies.answers import KeyRegression
-from twin.studies.sentences import metric_name, metric_value
 from twin.studies.statistics import Array
 
 PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["limit"], COLOURS["link"]
@@ -72,7 +72,11 @@ def metric_axis(axis: Any, metric: str) -> None:
 
 
 def axis_label(metric: str) -> str:
-    return textwrap.fill(metric_name(metric), 26)
+    return textwrap.fill(words(metric), 26)
+
+
+def key_label(key: str) -> str:
+    return textwrap.fill(label(key), 26)
 
 
 def pass_probability(analysis: StudyAnalysis) -> Figure | None:
@@ -87,7 +91,7 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
         else:
             _error_bars(axes, x, [analysis.proportion(rows[groups == k])[:3] for k in np.unique(groups)], line="")
         _shade_answers(axes, analysis, key)
-        axes.set(ylim=(-0.03, 1.03), xlabel=key)
+        axes.set(ylim=(-0.03, 1.03), xlabel=key_label(key))
         axes.yaxis.set_major_formatter(lambda value, _: percent(value))
     panels[0].set_ylabel("pass probability")
     return figure
@@ -119,7 +123,7 @@ def passing_map(analysis: StudyAnalysis) -> Figure | None:
     axes.plot(x[record.unknown], y[record.unknown], "x", color=COLOURS["truth"], markersize=3.5)
     for axis, edges in zip((axes.xaxis, axes.yaxis), found.edges, strict=True):
         value_axis(axis, edges, ticks=6)
-    axes.set(xlabel=found.keys[0], ylabel=found.keys[1])
+    axes.set(xlabel=key_label(found.keys[0]), ylabel=key_label(found.keys[1]))
     return figure
 
 
@@ -216,7 +220,7 @@ def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
             axes.axhline(limit, color=LIMIT, linestyle="--", linewidth=1)
         value_axis(axes.yaxis, y)
         metric_axis(axes.yaxis, metric)
-        axes.set_xlabel(key)
+        axes.set_xlabel(key_label(key))
     return figure
 
 
@@ -244,7 +248,8 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
         axes.set(xlim=(-1.05, 1.05), ylim=(0.6 - len(keys), 0.6), xlabel="rank correlation")
         axes.set_title(axis_label(metric), fontsize=9)
         axes.grid(visible=False, axis="y")
-        axes.set_yticks([-k for k in range(len(keys))], keys if axes.get_position().x0 == left else [])
+        names = [axis_label(key) for key in keys]
+        axes.set_yticks([-k for k in range(len(keys))], names if axes.get_position().x0 == left else [])
     return figure
 
 
@@ -258,7 +263,7 @@ def key_histograms(analysis: StudyAnalysis) -> Figure | None:
     style = {"color": [PASSED, NOT_PASSED], "label": ["passed", "not passed"], "alpha": 0.85}
     for (key, x), axes in zip(numeric.items(), panels, strict=True):
         _histogram(axes, [x[good], x[bad]], x[analysis.evaluated], **style)
-        axes.set_xlabel(key)
+        axes.set_xlabel(key_label(key))
     panels[0].set_ylabel("surveys")
     panels[0].legend(fontsize=8)
     return figure
@@ -269,7 +274,7 @@ def agreement_of_pairs(analysis: StudyAnalysis) -> Figure:
     for metric, axes in zip(analysis.study.compare, panels, strict=True):
         _draw_pairs(axes, *agreement.values_of_pairs(analysis, metric))
         if axes.lines:
-            axes.set_title(textwrap.fill(metric_name(metric), 30), fontsize=8)
+            axes.set_title(textwrap.fill(words(metric), 30), fontsize=8)
     return figure
 
 

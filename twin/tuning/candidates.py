@@ -39,7 +39,8 @@ _POWER_OF_2 = ("sobol", "saltelli")  # designs that need a power of 2 as number 
 _CONFIRM_SEEDS = 1_000_000  # added to the sampling seed of the study for the confirmation of finalists
 _RENDER_SEEDS = 2_000_000  # added to it for the rendered surveys
 _FORGIVEN = 2  # rendered surveys of a plan that may fail before it is given up
-_ALWAYS = ("timing.simulated_s", "map.le90_area_m")  # compared with the starting plan in any case
+VISIBILITY = "water.visibility_m"
+_ALWAYS = ("timing.simulated_s", "map.le90_area_m", VISIBILITY)  # reported in any case
 _PENALTY = 1e9  # objective of a candidate without a finite median; Optuna does not accept infinity
 
 Values = dict[str, Any]  #: a plan: the value of each searched key

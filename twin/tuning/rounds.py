@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 from twin.core.checkpoint import check_inputs
 from twin.planning.summary import instructions
-from twin.report.number_formats import percent
+from twin.report.number_formats import duration, percent
 from twin.scenario.file import input_files
 from twin.scenario.model import Scenario
 from twin.studies.flight import Row
 from twin.studies.results_log import ResultsLog, key_of, write_parquet
-from twin.studies.run_time import duration, rendered_time
+from twin.studies.run_time import rendered_time
 from twin.studies.runner import Fleet, open_folder
 from twin.studies.study_file import Study
 from twin.tuning.candidates import (

@@ -1,6 +1,5 @@
 """Report of a search: tuning.html, pareto.png, and the plan: recommended.toml, or candidate.toml if it is not shown."""
 
-from collections.abc import Iterator
 from importlib.metadata import version
 from itertools import combinations
 from pathlib import Path
@@ -12,22 +11,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from twin.core.user_files import read_text
-from twin.report.html import render_page
-from twin.report.number_formats import percent, plain
+from twin.report.html import Paragraph, lines_of, render_page, render_paragraphs, render_text
 from twin.report.plotting import log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.report.words import values_in_words
 from twin.scenario.file import dump_toml
 from twin.studies import sentences
-from twin.studies.conditions import condition_lines
+from twin.studies.conditions import condition_lines, varied_in_words
 from twin.studies.report import json_tree
-from twin.studies.sentences import metric_name, metric_value
-from twin.studies.study_figures import axis_label, make_panels, metric_axis, value_axis
-from twin.tuning.candidates import Candidate, pareto_front, required_probability, tuning_config
+from twin.studies.study_figures import axis_label, key_label, make_panels, metric_axis, value_axis
+from twin.tuning.candidates import VISIBILITY, Candidate, pareto_front, required_probability, tuning_config
 from twin.tuning.rounds import TuningResult
 from twin.tuning.verification import Verification
 
 RECOMMENDED, UNPROVEN = "recommended.toml", "candidate.toml"  #: files of the plan
-_LARGE_RATIO = 1.5  # a median ratio rendered / surrogate above this value, or below its inverse, gives a warning
 _DOT = {"linestyle": "", "marker": "o", "markersize": 4}
 Groups = list[tuple[list[Candidate], dict[str, Any]]]
 
@@ -38,6 +35,7 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
     front = pareto_front(result.candidates, tuning_config(result.study))
     groups, figures, compared = _groups(shown, front, result), {}, compared_plans(result)
     known = {n for c in compared for n, (_, flown) in c.verification.medians.items() if flown is not None}
+    known.discard(VISIBILITY)  # the same for all plans
     with matplotlib.rc_context(FIGURE_STYLE):
         trade_off = _trade_off_figure(groups, result)
         if shown:
@@ -50,13 +48,13 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
         "result": result,
         "front": front,
         "sentences": sentences,
-        "headline": headline(result),
-        "conditions": condition_lines(result.study),
+        "paragraphs": paragraphs(result),
         "warnings": warnings(result),
         "figures": figures,
         "compared": compared,
         "metrics": [name for name in (compared[0].verification.medians if compared else ()) if name in known],
         "required": required_probability(result.study),
+        "chosen": result.recommended or result.unproven,
         "plan": plan_toml(result),
         "plan_file": plan_file(result),
         "text": read_text(result.study.source.path),
@@ -69,64 +67,31 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
         (folder / name).write_text(page["plan"], encoding="utf-8")
 
 
+def paragraphs(result: TuningResult) -> list[Paragraph]:
+    """Returns what the search answers, how sure it is, what it assumes, what breaks and limits it."""
+    chosen, failed = result.recommended or result.unproven, result.failed_cheaper
+    limits = result.study.limits or (result.scenario.require if result.scenario else {})
+    known = {
+        "result": result,
+        "chosen": chosen,
+        "found": result.verification(chosen),
+        "failed": failed,
+        "failed_values": failed and _values(failed.surrogate),
+        "limits": sentences.limits_in_words(limits),
+        "required": required_probability(result.study),
+        "varied": varied_in_words(result.study),
+        "conditions": condition_lines(result.study),
+        "sentences": sentences,
+    }
+    return render_paragraphs("tuning_answer.txt.j2", known, "twin.tuning")
+
+
 def headline(result: TuningResult) -> str:
-    """Returns the main result: the recommended plan with its medians and pass probability, or why there is none."""
-    count = f"{len(result.candidates)} plans were evaluated"
-    if n_rendered := len(result.verifications):
-        start = " and the starting plan" if result.start else ""
-        count += f", {n_rendered} of them{start} also in rendered surveys"
-    chosen, failed = result.recommended, result.failed_cheaper
-    if (verification := result.verification(chosen)) is None or chosen is None:
-        return f"No plan is recommended: {_missing_plan(result, count)}"
-    medians = ", ".join(
-        f"{metric_name(name)} {metric_value(name, rendered)} ({metric_value(name, surrogate)})"
-        for name, (surrogate, rendered) in verification.medians.items()
-        if rendered is not None
-    )
-    limits = ", ".join(sentences.limits_in_words(result.study.limits)) or "the requirements of its scenario met"
-    lines = [
-        f"{result.instructions}: {verification.counts()}; {verification.state()}.",
-        f"Medians of these surveys (in brackets, of the fast surrogate model): {medians}.",
-        verification.limited_by and f"What limits its heights: {verification.limited_by} of their stated variance.",
-        f"A survey passes if it is complete with {limits}. Beyond the conditions of this study (varied: "
-        f"{', '.join(result.study.vary) or 'none'}), on other floors and in other waters, the plan may fail.",
-        f"{count}; by the surrogate, pass probability with new seeds {sentences.confidence(chosen.pass_probability)}.",
-        f"In the scenario: {_values(chosen)}.",
-        failed and f"The next cheaper plan, {_values(failed.surrogate)}, is not shown: {failed.why_not()}.",
-        result.out_of_time and "The budget was used up before cheaper plans were tried.",
-    ]
-    return "\n".join(filter(None, lines))
+    return lines_of(paragraphs(result))
 
 
 def _values(plan: Candidate) -> str:
-    return ", ".join(f"{key} = {plain(value)}" for key, value in plan.values.items())
-
-
-def _missing_plan(result: TuningResult, count: str) -> str:
-    budget = " The budget was used up; --resume continues." if result.out_of_time else ""
-    required = percent(required_probability(result.study))
-    if result.interrupted:
-        return f"{count}, and the search was interrupted before a plan was shown."
-    if (plan := result.unproven) is not None:
-        verification = result.verification(plan)
-        flown = "it has no rendered surveys"
-        if verification is not None:
-            flown = f"{verification.counts()}; {verification.state()}"
-        predicted = sentences.confidence(plan.pass_probability)
-        return (
-            f"none is shown to reach {required} in rendered surveys. The closest one: {result.instructions}; {flown}. "
-            f"By the surrogate, pass probability with new seeds {predicted}. {count}.{budget} In the scenario, "
-            f"{_values(plan)}."
-        )
-    if not result.verifications:
-        return f"{count}, and none reached the required pass probability of {required} with new seeds.{budget}"
-    numbers = np.array([(v.surveys, v.n_passed, v.n_failed) for v in result.verifications])
-    surveys, passed, n_failed = numbers.sum(axis=0).tolist()
-    failed = f"; {n_failed} more failed because of the computer or the program, --resume flies them" if n_failed else ""
-    return (
-        f"none is shown to reach {required} in rendered surveys. {count}; {passed} of {surveys - n_failed} rendered "
-        f"surveys passed{failed}.{budget}"
-    )
+    return ", ".join(values_in_words(key, [value]) for key, value in plan.values.items())
 
 
 class ComparedPlan(NamedTuple):
@@ -152,26 +117,9 @@ def compared_plans(result: TuningResult) -> list[ComparedPlan]:
 
 def warnings(result: TuningResult) -> list[str]:
     """Returns warnings on errors of the surrogate, refused plans, and of surveys."""
-    chosen, texts = result.verification(result.recommended), []
-    for verification in [chosen] if chosen else result.verifications:
-        texts += _surrogate_errors(verification)
-        texts += [f"{text} (in {n} rendered surveys)" for text, n in verification.warnings.items()]
-    texts += [
-        f"{n} of {len(result.candidates)} plans could not be flown in the search: {reason}"
-        for reason, n in result.refused.items()
-    ]
-    return texts + [f"{text} (in {n} surveys of the finalists by the surrogate)" for text, n in result.warnings.items()]
-
-
-def _surrogate_errors(verification: Verification) -> Iterator[str]:
-    """Yields a sentence for each metric whose medians differ much between surrogate and rendered surveys."""
-    for name, ratio in verification.ratio.ratios.items():
-        if not 1 / _LARGE_RATIO <= ratio <= _LARGE_RATIO:
-            surrogate, rendered = (metric_value(name, value) for value in verification.medians[name])
-            yield (
-                f"Plan {verification.surrogate.number}: the surrogate is wrong about the {metric_name(name)}: "
-                f"{surrogate} expected, {rendered} in rendered surveys."
-            )
+    chosen = result.verification(result.recommended)
+    known = {"result": result, "flown": [chosen] if chosen else result.verifications, "sentences": sentences}
+    return render_text("tuning_warnings.txt.j2", known, "twin.tuning").splitlines()
 
 
 def summary(result: TuningResult) -> dict[str, Any]:
@@ -278,7 +226,7 @@ def _searched_keys_figure(groups: Groups, result: TuningResult) -> Figure:
             axes.plot([c.values[key] for c in candidates], [c.objectives[k] for c in candidates], **style)
         if config.search[key].kind == "log_uniform":
             log_axis(axes.xaxis)
-        axes.set_xlabel(key)
+        axes.set_xlabel(key_label(key))
         _format_axis(axes.yaxis, config.objectives[k])
     return figure
 

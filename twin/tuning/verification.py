@@ -1,12 +1,14 @@
 """Verification of a plan: the results of its rendered surveys, what they show, and how many more are needed."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from twin.judge.map_error import CAUSES, cause_shares
+from twin.judge.map_error import cause_shares
 from twin.judge.summary_statistics import rms
-from twin.report.number_formats import length, percent
+from twin.report.number_formats import percent
 from twin.studies.analysis import count_similar
 from twin.studies.statistics import Proportion, exact_interval, trials_to_show
 from twin.tuning.candidates import Candidate, CandidateSurveys, SurveyScore, median_of, required_probability
@@ -29,7 +31,8 @@ class Verification(NamedTuple):
     search_round: int  #: round of the search, from 0
     warnings: dict[str, int]  #: for each warning, the number of rendered surveys that have it
     reasons: dict[str, int]  #: for each reason, the number of rendered surveys that did not pass
-    limited_by: str = ""  #: causes of the stated height errors of rendered surveys, with their shares; "": not known
+    #: stated height error [m] of rendered surveys by its cause, and its share of the variance; see `cause_shares`
+    causes: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
     @property
     def probability(self) -> Proportion:
@@ -106,13 +109,10 @@ def verification_of(
         search_round,
         rendered.warnings([surrogate]),
         count_similar(score.reason for score in scores if not score.passed),
-        _limits(scores),
+        _causes(scores),
     )
 
 
-def _limits(scores: list[SurveyScore]) -> str:
+def _causes(scores: list[SurveyScore]) -> dict[str, tuple[float, float]]:
     names = scores[0].causes if scores else ()
-    stated = {name: rms(np.array([score.causes.get(name) or 0.0 for score in scores])) for name in names}
-    return ", ".join(
-        f"{CAUSES[cause]} {length(m)} ({percent(share)})" for cause, (m, share) in cause_shares(stated).items()
-    )
+    return cause_shares({name: rms(np.array([score.causes.get(name) or 0.0 for score in scores])) for name in names})
