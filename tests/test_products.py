@@ -327,7 +327,11 @@ def run_command(monkeypatch, capsys, *arguments):
 def test_twin_change_says_what_grew_and_writes_page_json_and_maps(monkeypatch, capsys, tmp_path, runs):
     out = tmp_path / "change"
     status, text = run_command(monkeypatch, capsys, "change", *runs, "--out", out, "--scale", "0.16")
-    assert not status and "Growth: +" in text and "Compared with the true change: 1 of 1 changed regions found" in text
+    assert (
+        not status
+        and text.startswith("1 patch of the floor changed. Growth: +")
+        and "Compared with the true change: 1 of 1 changed regions found" in text
+    )
     tree = json.loads((out / "change.json").read_text())
     assert len(tree["patches"]) == 1 and tree["truth"]["false_patches"] == 0
     difference = geotiff.read_raster(out / "difference.tif")

@@ -689,9 +689,11 @@ def _show(as_json: bool, tree: Any, tables: Iterable[tuple[str, list[tuple[str, 
 
 
 def _write_results(results: "Results", folder: Path, as_json: bool) -> None:
+    from twin.report.html import lines_of
+
     with _results_folder(folder, f"{results.name}.html"):
         page = results.write(folder)
-    _show(as_json, results.tree, [], "\n".join([*results.sentences, f"Page: {page}"]))
+    _show(as_json, results.tree, [], f"{lines_of(results.paragraphs)}\nPage: {page}")
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from twin.products.change import Change, change_between
 from twin.products.registration import PARAMETERS, Heights
 from twin.products.surface import Layer, block_means, slope_deg
 from twin.products.survey_products import error_field_of_map, survey_products
-from twin.report.html import render_page, render_text
+from twin.report.html import Paragraph, render_page, render_paragraphs
 from twin.report.map_figures import map_axes, scalar_map
 from twin.report.plotting import WIDTH_IN, drawn, extent_of, hillshade
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
@@ -37,8 +37,8 @@ class Results(NamedTuple):
     outlined: Layer | None = None  #: mask of the cells of patches, on the grid of the layers
 
     @property
-    def sentences(self) -> list[str]:
-        return render_text("products.txt.j2", self.variables, "twin.products").split("\n")[:-1]
+    def paragraphs(self) -> list[Paragraph]:
+        return render_paragraphs("products.txt.j2", self.variables, "twin.products")
 
     def write(self, folder: Path) -> Path:
         """Writes page, JSON file and GeoTIFFs to a folder; returns the path of the page."""
@@ -47,7 +47,7 @@ class Results(NamedTuple):
         for name, (raster, description, unit) in self.layers.items():
             band = f"{description} [{unit}]"
             write_layer(folder / f"{name}.tif", raster.values, raster.grid, band, self.run.georeference)
-        shown = {"sentences": self.sentences, "figures": drawn({"maps": self.draw})}
+        shown = {"paragraphs": self.paragraphs, "figures": drawn({"maps": self.draw})}
         variables = self._asdict() | self.variables | shown
         page = folder / f"{self.name}.html"
         page.write_text(render_page("twin.products", "products.html.j2", variables), encoding="utf-8")
