@@ -1,11 +1,12 @@
 """First screens of all kinds of pages: `python docs/page_pictures.py FOLDER`, JPEG files of pages that exist below.
 
     twin run quickstart --out runs/pages/run
-    twin run quickstart --set control.hold_s=1.5 --out runs/pages/second
+    twin run quickstart --seed 2 --set scene_seed=1 --set objects.2.growth_m=0.05 --out runs/pages/second
     twin products runs/pages/run --out runs/pages/products
     twin change runs/pages/run runs/pages/second --out runs/pages/change
     twin compare runs/pages/run runs/pages/second --out runs/pages/compare.html
-    twin study scenes/studies/turbidity.toml --out runs/pages/study
+    twin study turbidity --out runs/pages/study
+    twin tune docs/pages/murky.toml --out runs/pages/tuning
     python docs/page_pictures.py runs/pages
 
 A page without its file is left out. Needs Chromium.
@@ -27,7 +28,7 @@ PAGES = {
     "study": "study/study.html",
     "tuning": "tuning/tuning.html",
 }
-WIDTH_PX, HEIGHT_PX, QUALITY = 1280, 1000, 60
+WIDTH_PX, HEIGHT_PX, QUALITY = 1280, 1000, 52
 FLAGS = "--headless --no-sandbox --disable-gpu --hide-scrollbars --no-first-run".split()
 
 
