@@ -338,6 +338,11 @@ def test_twin_change_says_what_grew_and_writes_page_json_and_maps(monkeypatch, c
     assert difference.grid == grid() and np.nanmax(difference.values) > 0.02
     page = (out / "change.html").read_text()
     assert page.count("data:image/png;base64,") == 1 and "Growth: +" in page and "RUN1" not in page
+    assert (
+        page.index("Growth: +")
+        < page.index("is found with a probability of 95 %")
+        < page.index("What does it not see?")
+    )
 
 
 def test_twin_products_says_rugosity_with_grain_and_plane(monkeypatch, capsys, tmp_path, runs):
@@ -350,6 +355,10 @@ def test_twin_products_says_rugosity_with_grain_and_plane(monkeypatch, capsys, t
     )
     page = (tmp_path / "p" / "products.html").read_text()
     assert "over the fitted plane" in page and "grain" in page
+    first = f"<p>Rugosity {best['rugosity']['value']:.3f} ± "
+    assert (
+        page.index(first) < page.index("Can you rely on it?") < page.index("What would break it?") < page.index("<img")
+    )
     assert (tmp_path / "p" / "slope.tif").is_file()
 
 
