@@ -172,8 +172,11 @@ def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(sea
     _, result, folder = searched
     headline = tuning_report.headline(result)
     target = "height error on 90 % of the mapped cells (LE90) at most 1.0 cm"
-    assert f"6 of 6 simulated surveys with rendered images reached the target: {target}." in headline.splitlines()[0]
-    assert "images): with 95 % confidence at least 54.1 % pass, 50 % required." in headline
+    assert (
+        f"6 of 6 simulated surveys with rendered images reached the target: {target}; with 95 %"
+        in headline.splitlines()[0]
+    )
+    assert "; with 95 % confidence at least 54.1 % pass, 50 % required." in headline.splitlines()[0]
     limits = headline.partition("What limits it, and what reduces that? ")[2]
     assert limits.startswith("Noise of the stereo matching (contrast, ") and "stated as 4.0 mm, 64 % of the" in limits
     assert "Errors of the camera poses, stated as 3.0 mm, 36 % of the variance. Less with more sidelap" in limits

@@ -106,7 +106,7 @@ def limit_sentence(key: str, limit: KeyLimit | None, required: float | None) -> 
     else:
         interval = f"below {rounded(limit.high)}" if np.isfinite(limit.high) else f"above {rounded(limit.low)}"
     value = f"is {rounded(limit.value)}{unit_text(key)}" if np.isfinite(limit.value) else "is not known"
-    named = f"The limit of {words(key)}, {'above' if limit.rises else 'below'} which {percent(required)} pass, {value}"
+    named = f"The estimated limit of {words(key)}, {'above' if limit.rises else 'below'} which {percent(required)} pass, {value}"
     return f"{named} ({percent(LEVEL)} interval: {interval}). "
 
 
@@ -118,7 +118,7 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     name, unit = words(key), unit_text(key)
     constant = f"{name} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
     fraction = f"at least {percent(required)} of surveys pass"
-    parts = [f"no value of {name} is known at which {fraction}"]
+    parts = [f"no value of {name} is shown yet at which {fraction}"]
     if passes:
         parts = [f"{fraction} at {name} {_labels(passes)}{unit}"]
     if fails:
