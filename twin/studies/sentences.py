@@ -106,7 +106,8 @@ def limit_sentence(key: str, limit: KeyLimit | None, required: float | None) -> 
     else:
         interval = f"below {rounded(limit.high)}" if np.isfinite(limit.high) else f"above {rounded(limit.low)}"
     value = f"is {rounded(limit.value)}{unit_text(key)}" if np.isfinite(limit.value) else "is not known"
-    named = f"The estimated limit of {words(key)}, {'above' if limit.rises else 'below'} which {percent(required)} pass, {value}"
+    side = "above" if limit.rises else "below"
+    named = f"The estimated limit of {words(key)}, {side} which {percent(required)} pass, {value}"
     return f"{named} ({percent(LEVEL)} interval: {interval}). "
 
 
