@@ -28,6 +28,7 @@ from twin.core.records import Estimate, Frame, MapGrid, Readings, StereoRig, Tra
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.report import recording, recording_surfaces
+from twin.report.frame_recorder import FrameRecorder
 from twin.report.images import jpeg_bytes
 from twin.report.run_folder import Raster, load_run, read_mosaic
 from twin.report.run_writer import link_residuals, position_cov_m2
@@ -369,6 +370,24 @@ def test_curves_of_the_attitude_are_those_of_the_body(folder):
     np.testing.assert_allclose(logged["attitude/roll/online"], np.rad2deg(0.02), atol=1e-9)
     np.testing.assert_allclose(logged["attitude/pitch/online"], np.rad2deg(-0.05), atol=1e-9)
     np.testing.assert_allclose(logged["attitude/heading/online"], heading_deg, atol=1e-9)
+
+
+def test_the_thrusts_of_a_recorded_flight_become_curves(folder, tmp_path, monkeypatch):
+    thrusts, poses = np.random.default_rng(4).normal(0, 5, (7, 3)), np.tile(np.eye(4), (7, 1, 1))
+    logged = {}
+
+    def log_curve(stream, run, entity, frames, values, role=""):
+        logged[entity] = values
+
+    monkeypatch.setattr(recording, "log_curve", log_curve)
+    flown = replace(load_run(folder), folder=tmp_path, trajectories={})
+    recording.log_curves(None, flown, SCENARIO.believed_rig())  # pyright: ignore[reportArgumentType]
+    assert not [entity for entity in logged if "thrust" in entity]  # nothing is recorded
+    with FrameRecorder(tmp_path, "keyframes") as recorder:
+        for k, (pose, thrust_n) in enumerate(zip(poses, thrusts, strict=True)):
+            recorder.add(Frame(k, k / 30, np.zeros((4, 4, 3), np.uint8), None, Readings()), pose, np.zeros(6), thrust_n)
+    recording.log_curves(None, flown, SCENARIO.believed_rig())  # pyright: ignore[reportArgumentType]
+    np.testing.assert_array_equal([logged[f"thrust/{k}"] for k in (1, 2, 3)], thrusts.T)
 
 
 def views(part) -> list:

@@ -10,6 +10,8 @@ from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.session.assembly import make_navigator, open_world
+from twin.simulate.kinematic_vehicle import KinematicVehicle
+from twin.simulate.thrusters import thruster_wrench
 from twin.survey import fly
 from twin.world.computer import frames_of_latency, latency_s
 from twin.world.mission import prepare
@@ -45,6 +47,18 @@ def test_a_command_arrives_after_the_latency(dynamics, n):
     assert np.abs(commands[k]).max() > 0.01
     assert np.shape(commands) == (k + 1, n)
     assert np.abs(make_pilot(prompt)(here, there)).max() > 0.01
+
+
+def test_the_thrust_of_a_world_is_the_one_that_moves_its_vehicle():
+    with open_world(mission(), Stopwatch()) as world:
+        vehicle = world.vehicle
+        assert not isinstance(vehicle, KinematicVehicle)
+        for _ in range(30):  # the lag settles
+            world.act(np.linspace(-0.6, 0.8, 8))
+        wrench = vehicle.thrusters.configuration @ world.thrust_n
+        np.testing.assert_allclose(wrench, thruster_wrench(vehicle.thrusters), atol=1e-9)
+        np.testing.assert_allclose(world.thrust_n, vehicle.thrusters.steady_n, rtol=1e-3, atol=1e-2)
+        assert np.abs(world.thrust_n).max() > 1
 
 
 def test_pose_and_reference_are_predicted_to_the_time_of_the_command():

@@ -145,7 +145,7 @@ def _fly_recorded(
                 taken = replace(frame, readings=world.measured)
                 if mission.scenario.record == "all" and frame.right is None:
                     taken = replace(taken, right=world.right_image())
-                recorder.add(taken, world.world_from_camera, world.vehicle.twist_body)
+                recorder.add(taken, world.world_from_camera, world.vehicle.twist_body, world.thrust_n)
                 survey.monitor(estimate, frame)
 
             actions = survey.monitor.actions

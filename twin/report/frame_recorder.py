@@ -37,14 +37,15 @@ class FrameRecorder:
     """Writes frames to the folder `frames` of a run while the survey is flown. Use as a context manager.
 
     `frames.csv` has index, time, exposure and sensor readings (without beacons and IMU) of every frame, and whether it
-    has a stereo pair; `imu.csv` the readings of the IMU in body axes; `truth.npz` true poses and velocities in double
-    precision. With `record` = "all", `left` and `right` have the images as PNG files; with "keyframes" they are those
-    in `keyframes`; with "none", nothing is written. OSError if the folder cannot be written, or on exit an image.
+    has a stereo pair; `imu.csv` the readings of the IMU in body axes; `truth.npz` true poses, velocities and thrusts in
+    double precision. With `record` = "all", `left` and `right` have the images as PNG files; with "keyframes" they are
+    those in `keyframes`; with "none", nothing is written. OSError if the folder cannot be written, or on exit an image.
     """
 
     def __init__(self, folder: Path, record: Record):
         self._folder, self._record = folder / "frames", record
         self._poses, self._twists = GrowingArray(4, 4), GrowingArray(6)
+        self._thrusts: list[Array] = []
         self._writer = ThreadPoolExecutor(1)  # compresses while the next frame is rendered
         self._waiting: deque[Future[None]] = deque()
         self._tables: dict[str, TextIO] = {}
@@ -76,21 +77,25 @@ class FrameRecorder:
             file.close()
         if self._record != "none":
             truth = {"world_from_camera": self._poses.array, "twist_body": self._twists.array}
+            if self._thrusts:
+                truth["thrust_n"] = np.array(self._thrusts)
             np.savez(self._folder / "truth.npz", allow_pickle=False, **truth)
         if kind is None:
             for written in self._waiting:
                 written.result()
 
-    def add(self, frame: Frame, world_from_camera: Array, twist_body: Array) -> None:
+    def add(self, frame: Frame, world_from_camera: Array, twist_body: Array, thrust_n: Array | None = None) -> None:
         """Adds a frame; raises OSError if an earlier image could not be written, for example on a full disk.
 
         The true pose (4, 4) is that of the left camera, `twist_body` (6,) the true [angular, linear] velocity in body
-        axes [rad/s, m/s].
+        axes [rad/s, m/s], `thrust_n` (n,) the thrust of each thruster [N].
         """
         if self._record == "none":
             return
         self._poses.append(world_from_camera)
         self._twists.append(np.asarray(twist_body, np.float64))
+        if thrust_n is not None:
+            self._thrusts.append(thrust_n)
         exposure = ["", "", ""] if frame.exposure is None else [repr(float(value)) for value in frame.exposure]
         stereo = int(frame.right is not None)
         cells = [frame.index, repr(float(frame.time_s)), stereo, *exposure, *_cells(frame.readings)]

@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import rerun as rr
@@ -35,6 +36,7 @@ N_SIGMA, LARGEST = 2, 0.02
 CURVES = {
     "error/position": "Position error [m]", "error/height": "Height error [m]", "error/heading": "Heading error [deg]",
     "attitude/roll": "Roll [deg]", "attitude/pitch": "Pitch [deg]", "attitude/heading": "Heading [deg]",
+    "thrust": "Thrust [N]",
 }  # fmt: skip
 
 #: Command of the Rerun viewer; --bind makes it accept connections from this machine only.
@@ -235,8 +237,17 @@ def log_curves(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
                 log_curve(recording, run, f"error/position/{name}", frames, errors.distance_m, name)
                 log_curve(recording, run, f"error/height/{name}", frames, errors.position_m[:, 2], name)
                 log_curve(recording, run, f"error/heading/{name}", frames, heading_deg, name)
+    for number, thrust_n in enumerate(_thrusts_n(run.folder / "frames" / "truth.npz").T, start=1):
+        log_curve(recording, run, f"thrust/{number}", np.arange(len(thrust_n)), thrust_n)
     for stage, (frames, values) in stage_durations(run).items():
         log_curve(recording, run, f"timing/{stage}", frames, values)
+
+
+def _thrusts_n(file: Path) -> Array:
+    """Returns the true thrust (frames, n) of each thruster [N]; empty if it was not recorded."""
+    with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(file) as arrays:
+        return arrays["thrust_n"]
+    return np.zeros((0, 0))
 
 
 def log_curve(

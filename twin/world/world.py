@@ -120,6 +120,13 @@ class World(ABC):
     def world_from_camera(self) -> Array:
         return left_camera(self.vehicle, self.mission.rig)
 
+    @property
+    def thrust_n(self) -> Array:
+        """Returns the thrust (n,) of each thruster now [N]; empty for a kinematic vehicle."""
+        if isinstance(self.vehicle, KinematicVehicle):
+            return np.zeros(0)
+        return self.vehicle.thrusters.c @ self.vehicle.thrusters.lag_state
+
     def start_sequence(self, sequence: FrameSequence) -> None:
         """Starts the next planned frames of a track, after all frames of the last sequence (or `end_sequence`)."""
         self._sequences.append(sequence)
