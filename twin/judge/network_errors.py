@@ -89,22 +89,26 @@ def network_residuals(result: SurveyResult) -> dict[str, float | int | None]:
     """Returns `replay.network` of metrics.json: residuals of the links at the final poses of their keyframes.
 
     `links` is the number of links with matched points, `loops` that of those whose nodes are more than two nodes apart.
-    The residual of a link is log(M^-1 T), with M its measured motion and T that between the final poses.
+    The residual of a link is that of `motion_residuals` at the final poses.
     `loop_translation_m` and `loop_rotation_deg` are medians of their norms over the loops, `loop_chi2` the mean of r'
     C^-1 r / 6 with C the covariance of the measurement, below about 1 for consistent covariances; all None without
     loops. They are not errors: an error that all links have in common does not appear in them.
     """
     along, loops = _measured_links(result)
-    poses = result.final.world_from_camera[result.keyframe_rows]
-    motions = zip(loops.i, loops.j, loops.i_from_j, strict=True)
-    logs = [geometry.log(geometry.inverse(motion) @ geometry.inverse(poses[i]) @ poses[j]) for i, j, motion in motions]
-    residuals = np.array(logs).reshape(-1, 6)
+    residuals = motion_residuals(loops, result.final.world_from_camera[result.keyframe_rows])
     chi2 = mean(nees(residuals, loops.own_cov))
     values = (
         len(along) + len(loops), len(loops), percentile(np.linalg.norm(residuals[:, 3:], axis=1), 50),
         percentile(np.rad2deg(np.linalg.norm(residuals[:, :3], axis=1)), 50), None if chi2 is None else chi2 / 6,
     )  # fmt: skip
     return dict(zip(NETWORK_KEYS, values, strict=True))
+
+
+def motion_residuals(links: Links, poses: Array) -> Array:
+    """Returns log(M^-1 T) (m, 6) of links, M being the measured motion and T that between the node poses (n, 4, 4)."""
+    motions = zip(links.i, links.j, links.i_from_j, strict=True)
+    logs = [geometry.log(geometry.inverse(motion) @ geometry.inverse(poses[i]) @ poses[j]) for i, j, motion in motions]
+    return np.array(logs).reshape(-1, 6)
 
 
 def stage_metrics(result: SurveyResult, truth: Truth) -> dict[str, dict[str, float | None]]:

@@ -25,6 +25,7 @@ from twin.core.records import Array, ElevationMap, MapGrid, SurveyResult, Trajec
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.exchange import posegraph
+from twin.judge.network_errors import motion_residuals
 from twin.judge.task_errors import SurveyedTask
 from twin.report.replay_description import RunDescription
 from twin.scenario import file as scenario_file
@@ -281,11 +282,10 @@ def position_cov_m2(result: SurveyResult) -> Array:
 def link_residuals(result: SurveyResult) -> Array:
     """Returns the normalised residuals sqrt(r' C^-1 r / 6) (m,) of links; about 1 for consistent covariances.
 
-    r is the residual at the final poses and C the covariance of the measurement (`network_errors.network_residuals`).
+    r is the residual at the final poses (`motion_residuals`) and C the covariance of the measurement.
     """
-    poses, links = result.final.world_from_camera[result.keyframe_rows], result.links
-    motions = np.linalg.inv(links.i_from_j) @ np.linalg.inv(poses[links.i]) @ poses[links.j]
-    residuals = np.array([geometry.log(motion) for motion in motions]).reshape(-1, 6)
+    links = result.links
+    residuals = motion_residuals(links, result.final.world_from_camera[result.keyframe_rows])
     chi2 = links.shared_by * np.einsum("ni,nij,nj->n", residuals, links.information, residuals)
     return np.sqrt(np.clip(np.nan_to_num(chi2), 0, 1e12) / 6)
 

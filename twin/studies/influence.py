@@ -7,7 +7,7 @@ import numpy as np
 from twin.studies import statistics
 from twin.studies.analysis import StudyAnalysis
 
-_LEAST_EXPLAINED = 0.05  # of the variance; less is hardly told from chance
+_LEAST_EXPLAINED = 0.05  # of the variance; less is hardly distinguishable from chance
 
 
 class KeyEnd(NamedTuple):
