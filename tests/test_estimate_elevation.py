@@ -239,12 +239,17 @@ def test_sigma_of_cells_within_three_cells_of_a_step_includes_its_smoothing():
         depth[:, columns] = 2.0 - height
         patches.append(surface.rasterise(depth_map(depth, 1e-8), down_camera(0, 0, 2.0), EXACT, RIG, GRID))
         mapper.fuse(patches[-1])
-    sigma, across_m = mapper.result().sigma_m[:, 100], np.abs(Y[:, 100])
+    found, across_m = mapper.result(), np.abs(Y[:, 100])
+    sigma, repeatability = found.sigma_m[:, 100], found.repeatability_m[:, 100]
     lateral_cells = np.mean([patch.lateral_m for patch in patches]) / GRID.cell_m
     near, away = across_m < 3 * GRID.cell_m, (across_m > 4 * GRID.cell_m) & (across_m < 0.3)
     # the heights 0, 0 and h of 3 x 3 cells have the RMS distance h / sqrt(18) from their plane
     np.testing.assert_allclose(sigma[near], 5 * lateral_cells * step_m / np.sqrt(18), rtol=1e-3)
     np.testing.assert_allclose(sigma[away], 1e-4, rtol=1e-2)
+    # between two surveys, only the position of the step differs
+    share, near = lateral_cells / 2, across_m < GRID.cell_m
+    np.testing.assert_allclose(repeatability[near], np.hypot(np.sqrt(share), share) * step_m, rtol=1e-3)
+    np.testing.assert_allclose(repeatability[away], 1e-4, rtol=1e-2)
 
 
 def test_roughness_is_the_rms_distance_from_the_least_squares_plane():

@@ -397,6 +397,8 @@ class ElevationMap:
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
     #: RMS of the differences of heights from two disjoint sets of keyframes / their standard deviation; None: unknown.
     scatter: float | None = None
+    #: (rows, cols) part of sigma_m squared that is equal in two surveys of a floor [m^2]; negative: they differ more.
+    common_m2: NDArray[np.float32] | float = 0.0
     variances: HeightVariances = HeightVariances()  #: mean of sigma_m squared over the typical cells, in parts
 
     @property
@@ -404,6 +406,11 @@ class ElevationMap:
         """Returns the mask (rows, cols) of the 95 % most certain cells: all but those at steep walls."""
         known = np.isfinite(self.sigma_m)
         return self.sigma_m <= (np.percentile(self.sigma_m[known], 95) if known.any() else 0.0)
+
+    @property
+    def repeatability_m(self) -> NDArray[np.float32]:
+        """Returns the standard deviation (rows, cols) of the heights between two surveys of a floor [m]."""
+        return np.sqrt(np.maximum(self.sigma_m**2 - self.common_m2, 0)).astype(np.float32)
 
     def to_world(self, points: Array) -> Array:
         return geometry.transform(geometry.inverse(self.map_from_world), points)

@@ -52,10 +52,12 @@ class Raster(NamedTuple):
 def write_map(
     folder: Path, elevation_map: ElevationMap, georeference: Georeference | None = None, mosaic: bool = True
 ) -> None:
-    """Writes dem.tif and dem_sigma.tif to a folder and, if `mosaic` is true, mosaic.tif with the colours of cells."""
+    """Writes dem.tif, dem_sigma.tif and dem_repeatability.tif to a folder and, if `mosaic` is true, mosaic.tif."""
     grid = elevation_map.grid
     write_elevations(folder / "dem.tif", elevation_map.height_m, grid, "elevation [m]", georeference)
     write_layer(folder / "dem_sigma.tif", elevation_map.sigma_m, grid, "standard deviation [m]", georeference)
+    repeatability = "standard deviation between two surveys [m]"
+    write_layer(folder / "dem_repeatability.tif", elevation_map.repeatability_m, grid, repeatability, georeference)
     if mosaic:
         write_mosaic(folder / "mosaic.tif", elevation_map.mosaic, grid, georeference)
 

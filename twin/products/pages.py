@@ -106,7 +106,7 @@ def change_of(first_folder: Path, second_folder: Path, scale_m: float) -> Result
     Raises TwinError if a run has no map with standard deviations, or their maps cannot be compared.
     """
     first, second = load_run(first_folder), load_run(second_folder)
-    heights, others = _heights(first, "RUN1"), _heights(second, "RUN2")
+    heights, others = _heights(first, "RUN1", "repeatability"), _heights(second, "RUN2", "repeatability")
     cell_m, other_m = heights.grid.cell_m, others.grid.cell_m
     if not np.isclose(other_m, cell_m, rtol=1e-6):
         raise TwinError("RUN2", f"its map has cells of {other_m:g} m", f"those of RUN1, {cell_m:g} m")
@@ -158,11 +158,12 @@ def judged(change: Change, true_m: Layer) -> dict[str, Any]:
     }
 
 
-def _heights(run: Run, name: str) -> Heights:
-    for layer in ("dem", "dem_sigma"):
+def _heights(run: Run, name: str, kind: str = "sigma") -> Heights:
+    layers = "dem", f"dem_{kind}" if f"dem_{kind}" in run.rasters else "dem_sigma"
+    for layer in layers:
         if layer not in run.rasters:
             raise TwinError(name, f"{run.folder} has no {layer}.tif", "a run with a map")
-    return Heights(run.rasters["dem"].grid, run.rasters["dem"].values, run.rasters["dem_sigma"].values)
+    return Heights(run.rasters["dem"].grid, *(run.rasters[layer].values for layer in layers))
 
 
 def _tree(value: Any) -> Any:

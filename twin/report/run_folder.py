@@ -20,7 +20,7 @@ from twin.scenario.toml_text import parse_toml
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
 SCENARIO_FILE = "scenario.resolved.toml"
-RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error")
+RASTERS = ("dem", "dem_sigma", "dem_repeatability", "dem_truth", "dem_error")
 
 
 class Network(NamedTuple):

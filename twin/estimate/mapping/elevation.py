@@ -39,7 +39,9 @@ class ElevationMapper:
     The depth variance is independent between patches; the variance of pose and smoothing is common to them, so it is
     averaged. The result adds the variance of the choice between hypotheses, and that of steps and ridges, which the
     matching window smooths: the square of `_SMOOTHING` times the standard deviation of the lateral error, in cells,
-    times the largest roughness within two cells.
+    times the largest roughness within two cells. Smoothing is the same in two surveys of a floor; what differs is, with
+    f the standard deviation of the lateral error per two cells, f^2 times the squared range of heights around the cell
+    and f times the squared step across it if larger than a cell.
     """
 
     def __init__(self, grid: MapGrid):
@@ -105,15 +107,18 @@ class ElevationMapper:
         fraction = lateral_m / (2 * self.grid.cell_m)
         height[_contradicted(height, variance + systematic + self.grid.cell_m**2, fraction)] = np.nan
         roughness_m = cv2.dilate(_roughness(height), np.ones((5, 5), np.uint8))
-        edge_m2 = (_SMOOTHING * lateral_m / self.grid.cell_m * roughness_m) ** 2
+        smoothing_m2 = (_SMOOTHING * lateral_m / self.grid.cell_m * roughness_m) ** 2
+        step_m, relief_m = _step(height), _relief(height)
+        moved_m2 = fraction * np.where(step_m > self.grid.cell_m, step_m, 0) ** 2 + (fraction * relief_m) ** 2
         choice_m2 = _WRONG_CHOICE * (1 - _WRONG_CHOICE) * np.nan_to_num(gap) ** 2
-        sigma = np.sqrt(variance + systematic + edge_m2 + choice_m2)
+        sigma = np.sqrt(variance + systematic + smoothing_m2 + choice_m2)
         sigma = np.where(np.isnan(height), np.nan, sigma).astype(np.float32)
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
         found = ElevationMap(self.grid, height, sigma, np.clip(mosaic + 0.5, 0, 255).astype(np.uint8))
+        found.common_m2 = (smoothing_m2 - moved_m2).astype(np.float32)
         if (typical := found.typical).any():
-            parts = variance, pose, systematic - pose + edge_m2 + choice_m2
+            parts = variance, pose, systematic - pose + smoothing_m2 + choice_m2
             found.variances = HeightVariances(*(float(part[typical].mean()) for part in parts))
         return found
 
@@ -172,6 +177,20 @@ def _trimmed_range(heights: Map) -> Map:
     ordered, known = np.sort(heights, axis=1), np.isfinite(heights).sum(axis=1)  # NaN last
     highest = np.take_along_axis(ordered, np.maximum(known - 3, 0)[:, None], axis=1)[:, 0]
     return np.where(known >= 6, highest - ordered[:, 2], np.float32(0))
+
+
+def _relief(height: Map) -> Map:
+    """Returns the range (rows, cols) of the known heights in 3 x 3 cells [m]; 0 without one."""
+    block, far = np.ones((3, 3), np.uint8), np.float32(1e6)
+    high, low = (np.where(np.isnan(height), limit, height) for limit in (-far, far))
+    return np.maximum(cv2.dilate(high, block) - cv2.erode(low, block), 0)
+
+
+def _step(height: Map) -> Map:
+    """Returns the largest absolute second difference (rows, cols) of height in four directions [m]; 0: unknown."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(height, 1, constant_values=np.nan), (3, 3))
+    pairs = ((around[..., i, j], around[..., 2 - i, 2 - j]) for i, j in _NEIGHBOURS[:4])
+    return np.nan_to_num(np.fmax.reduce([np.abs(one + other - 2 * height) for one, other in pairs]))
 
 
 def _roughness(height: Map) -> Map:

@@ -151,4 +151,5 @@ def with_scatter(elevation: ElevationMap, one: ElevationMap, other: ElevationMap
     scatter = float(np.sqrt(np.nanmean(ratio.astype(np.float64) ** 2)))
     factor = max(scatter, 1.0)
     parts = HeightVariances(*(factor**2 * part for part in elevation.variances))
-    return replace(elevation, sigma_m=elevation.sigma_m * np.float32(factor), scatter=scatter, variances=parts)
+    common_m2, sigma_m = elevation.common_m2 * np.float32(factor**2), elevation.sigma_m * np.float32(factor)
+    return replace(elevation, sigma_m=sigma_m, common_m2=common_m2, scatter=scatter, variances=parts)
