@@ -51,9 +51,11 @@ def maps(ratio, seed=0, n_common=4000):
 def test_standard_deviations_that_heights_contradict_are_multiplied_by_the_scatter():
     """The RMS of 4000 normal numbers is known to 1 / sqrt(8000) = 1.1 %."""
     for ratio in (2.5, 0.7):
-        found = with_scatter(*maps(ratio))
+        full, *parts = maps(ratio)
+        found = with_scatter(replace(full, common_m2=np.float32(0.003**2)), *parts)
         assert found.scatter == pytest.approx(ratio, rel=0.04)
         np.testing.assert_allclose(found.sigma_m, 0.004 * max(found.scatter, 1.0), rtol=1e-6)
+        np.testing.assert_allclose(found.repeatability_m, np.sqrt(7e-6) * max(found.scatter, 1.0), rtol=1e-5)
 
 
 def test_a_few_common_cells_are_no_test():

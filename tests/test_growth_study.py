@@ -1,6 +1,7 @@
 """Study of growth: 40 pairs of surrogate surveys of the reef of horseshoe_corals, between which three corals grow.
 
-The surrogate surveys the bare floor, so the corals are a part of its height file (`with_objects`).
+The surrogate surveys the bare floor, so the corals are a part of its height file (`with_objects`). Four pairs of
+rendered surveys, in which all corals of three kinds grow, show whether it is also true of images.
 """
 
 from functools import cache
@@ -79,3 +80,24 @@ def test_growth_is_found_with_the_stated_probability_and_volumes_have_their_sigm
     )
     assert inside > 0.9 - 3 * np.sqrt(0.09 / len(errors))
     assert sum(false) <= 6  # 39 pairs, 5 %: at most 6 with 99 %
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not OUTSIDE_DATA.is_dir(), reason="needs outside data")
+def test_growth_is_found_in_rendered_surveys_with_volumes_within_their_sigma(tmp_path):
+    """Of 7 corals, 6 grow by more than the errors; the volumes of 90 % are inside 1.645 sigma, at least 75 % of 24."""
+    small = ["plan.tracks=1", "plan.area_m=[1.2, 0.8]", "control.hold_s=0.5", "map.orthomosaic=false", "scene_seed=0"]
+    grown = [f"objects.{entry}.growth_m={growth_m}" for entry, growth_m in enumerate((0.05, 0.02, 0.05))]
+    folders = [tmp_path / name for name in ("before1", "before2", "after1", "after2")]
+    for k, folder in enumerate(folders):
+        overrides = [*small, *grown * (k > 1), f"seed={k + 1}"]
+        survey.run(load_scenario("horseshoe_corals", overrides), folder, outputs=())
+    truths = [change_of(one, other, SCALE_M).tree["truth"] for one in folders[:2] for other in folders[2:]]
+    errors = np.concatenate([truth["volume_error_over_sigma"] for truth in truths])
+    found, expected = (sum(truth[key] for truth in truths) for key in ("found", "expected"))
+    inside = np.mean(np.abs(errors) < 1.645)
+    print(f"rendered: found {found}, stated {expected:.1f}; volumes within their 90 % interval: {inside:.3f}")
+    assert abs(found - expected) < 3 and expected > 12
+    assert inside > 0.75
+    unchanged = [change_of(*folders[k : k + 2], SCALE_M).tree["patches"] for k in (0, 2)]
+    assert sum(map(bool, unchanged)) <= 1

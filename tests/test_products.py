@@ -243,6 +243,29 @@ def test_many_changed_areas_do_not_hide_each_other():
     assert pages.judged(change, change_m)["found"] == 8
 
 
+def test_changes_much_larger_than_the_errors_do_not_raise_the_threshold():
+    """Growth of 100 standard deviations on an eighth of the map; the threshold is that of the errors, not of these."""
+    change_m = sum(bump(x, y, 0.1, 0.15) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-0.7, 0.7))
+    errors, true_m = error_field(0.001, long_m=0.0), floor(*coordinates())
+    change = change_between(heights_with(errors, 3, true_m), heights_with(errors, 4, true_m + change_m), 0.2)
+    judged = pages.judged(change, change_m)
+    assert judged["found"] == judged["regions"] == 10 and change.threshold < 6
+
+
+def test_the_volume_of_a_patch_has_the_errors_that_the_maps_state():
+    """Unchanged cells agree better, as errors of smoothing are equal; the sum over all cells has their errors."""
+    errors, true_m = error_field(0.001, long_m=0.0), floor(*coordinates())
+    pair = heights_with(errors, 1, true_m), heights_with(errors, 2, true_m + bump(0.5, 0.4, 0.03))
+    change = change_between(*(heights._replace(sigma_m=np.full(SHAPE, 0.01)) for heights in pair), 0.16)
+    (patch,) = change.patches
+    area_m2, window_m = patch.area_m2, change.errors.window_m
+    # over an area much larger than the window, the sum of the correlations of a cell is pi window^2 / 5
+    expected_m3 = 0.01 * np.sqrt(2 * area_m2 * np.pi * window_m**2 / 5)
+    assert patch.volume_sigma.random == pytest.approx(expected_m3, rel=0.15)
+    everywhere = change.patch(np.ones(SHAPE, bool)).volume_sigma.random
+    assert everywhere < 0.5 * expected_m3 * np.sqrt(np.prod(SHAPE) * CELL_M**2 / area_m2)
+
+
 @pytest.mark.long
 def test_one_pair_in_twenty_shows_a_patch_without_change_and_volumes_have_their_sigma():
     """Of 100 pairs, 5 are expected; at most 11 with 99 %. The standard deviation of 100 normal numbers is 1 +- 0.2."""

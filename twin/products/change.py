@@ -22,8 +22,9 @@ NORMAL_95 = float(ndtri(0.975))
 DETECTION = 0.95  #: probability with which the detectable change is found
 _LARGEST_Z = 4.0  # of a cell in the smoothed difference: one mismatch is no patch
 _CALM_Z = 3.0  # of a square with which the errors are fitted at first
-_UPPER_PEAKS = 0.8  # quantile of the maxima above which their tail is fitted
-_CLEAN_SHARES = 0.5, 0.9, 0.9  # of the maxima above, in each round: at first, half of them may be changes
+#: Quantile of the maxima above which their tail is fitted, and the share of those above that are errors, in each round:
+#: at first, a quarter of all maxima may be changes.
+_TAILS = (0.5, 0.5), (0.8, 0.9), (0.8, 0.9)
 
 
 class Patch(NamedTuple):
@@ -56,9 +57,15 @@ class Change(NamedTuple):
         return [self.patch(self.labels == number) for number in range(1, self.labels.max() + 1)]
 
     def patch(self, inside: Mask) -> Patch:
-        """Returns mean change and volume of a mask of cells, which both maps have."""
+        """Returns mean change and volume of a mask of cells, which both maps have.
+
+        The fitted random error is that of unchanged cells, in which errors that depend on the shape of the floor, such
+        as those of smoothing, are equal in both maps. Where the shape has changed, they are as large as the maps state.
+        """
         weights, of_maps = inside * self.grid.cell_m**2, self.registration
-        random, correlated = (float(part[0, 0]) for part in self.errors.covariances(weights[None]))
+        sigma_m = np.where(self.labels > 0, np.fmax(of_maps.sigma_m, self.errors.sigma_m), self.errors.sigma_m)
+        parts = self.errors._replace(sigma_m=sigma_m).covariances(weights[None])
+        random, correlated = (float(part[0, 0]) for part in parts)
         lever = (of_maps.design * weights).sum(axis=(1, 2))
         parts = np.sqrt(np.maximum([random, correlated, lever @ of_maps.cov @ lever], 0.0))
         sigma = SigmaParts(*(float(part) for part in parts))
@@ -95,14 +102,14 @@ def change_between(first: Heights, second: Heights, scale_m: float) -> Change:
     weights = _weights(np.where(np.isfinite(of_maps.difference_m), of_maps.sigma_m, 0.0))
     ratio = _weighted_mean(np.nan_to_num(of_maps.difference_m), weights, side) * np.sqrt(_mean(weights, side))
     calm = np.abs(ratio) <= _CALM_Z * _normal_scale(ratio[weights > 0])
-    change = _look((first, second), calm, everywhere, side, _CLEAN_SHARES[0])
-    for clean_share in _CLEAN_SHARES[1:]:
+    change = _look((first, second), calm, everywhere, side, _TAILS[0])
+    for tail in _TAILS[1:]:
         calm = ~np.asarray(binary_dilation(change.labels > 0, iterations=(side + 1) // 2), bool)
-        change = _look((first, second), calm, calm, side, clean_share)
+        change = _look((first, second), calm, calm, side, tail)
     return change
 
 
-def _look(maps: tuple[Heights, Heights], stable: Mask, counted: Mask, side: int, clean_share: float) -> Change:
+def _look(maps: tuple[Heights, Heights], stable: Mask, counted: Mask, side: int, tail: tuple[float, float]) -> Change:
     """Returns the change if the errors are those of the `stable` cells; arguments as in `_threshold`."""
     of_maps, grid = register(*maps, stable), maps[0].grid
     errors = fitted(of_maps.difference_m, of_maps.sigma_m, grid.cell_m, stable)
@@ -112,7 +119,7 @@ def _look(maps: tuple[Heights, Heights], stable: Mask, counted: Mask, side: int,
     mean_m, mean_sigma_m = _smoothed(of_maps, errors, sigma_m, side)
     mean_sigma_m *= _normal_scale((mean_m / mean_sigma_m)[stable])  # independent errors average out faster
     ratio, sigma_m = np.nan_to_num(mean_m / mean_sigma_m), np.where(known, sigma_m, np.nan)
-    threshold = _threshold(ratio, counted, side, clean_share)
+    threshold = _threshold(ratio, counted, side, tail)
     level_m = float(np.quantile(np.abs(of_maps.difference_m / sigma_m)[stable & known], CONFIDENCE)) * sigma_m
     return Change(grid, of_maps, errors, sigma_m, level_m, mean_sigma_m, side, threshold, _labels(ratio, threshold))
 
@@ -134,20 +141,20 @@ def _smoothed(of_maps: MapRegistration, errors: ErrorField, sigma_m: Layer, side
     return _weighted_mean(difference_m, weights, side) + missing, np.sqrt(random_m2 + slow_m2) + missing
 
 
-def _threshold(ratio: Layer, counted: Mask, side: int, clean_share: float) -> float:
+def _threshold(ratio: Layer, counted: Mask, side: int, tail: tuple[float, float]) -> float:
     """Returns the |mean / sigma| that errors exceed anywhere in 5 % of the surveys, at least that of normal errors.
 
-    The tail of the maxima is exponential (generalised Pareto distribution of shape 0) from their 80th percentile on,
-    with the scale of the quantile `clean_share` of the maxima above; the others may be changes.
+    The tail of the maxima is exponential (generalised Pareto distribution of shape 0) from a quantile of them on, with
+    the scale of the quantile of the maxima above up to which they are errors (`_TAILS`); the others may be changes.
     """
-    size = np.abs(ratio)
+    (upper, clean_share), size = tail, np.abs(ratio)
     n_squares = max(int((size > 0).sum() / side**2), 1)
     normal = -float(ndtri((1 - CONFIDENCE) / 2 / n_squares))
     peaks = size[(size == maximum_filter(size, side)) & (size > 0) & counted]
-    start = np.quantile(peaks, _UPPER_PEAKS) if len(peaks) else 0.0
+    start = np.quantile(peaks, upper) if len(peaks) else 0.0
     excess = peaks[peaks > start] - start
-    tail = np.quantile(excess, clean_share) / -np.log(1 - clean_share) if len(excess) else 0.0
-    return max(normal, float(start + tail * np.log(max(len(excess), 1) / (1 - CONFIDENCE))))
+    scale = np.quantile(excess, clean_share) / -np.log(1 - clean_share) if len(excess) else 0.0
+    return max(normal, float(start + scale * np.log(max(len(excess), 1) / (1 - CONFIDENCE))))
 
 
 def _labels(ratio: Layer, threshold: float) -> Layer:

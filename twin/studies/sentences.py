@@ -15,7 +15,6 @@ from twin.studies.answers import Answer, KeyLimit, rounded
 from twin.studies.conditions import condition_lines, varied_in_words
 from twin.studies.influence import influences
 from twin.studies.statistics import LEVEL, Interval, Proportion
-from twin.studies.study_file import Study
 
 
 def metric_heading(metric: str) -> str:
@@ -179,14 +178,3 @@ def _refusals(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> tuple[str, 
     n = len(np.unique(analysis.numbers("sample")[chosen]))
     count = f"{counted(n, 'sample')} ({counted(int(chosen.sum()), 'survey')})"
     return count, "is" if n == 1 else "are", next(iter(count_similar(analysis.reason[chosen])))
-
-
-def seeds_note(study: Study) -> str:
-    sampling = study.sampling
-    if not sampling.paired:
-        return "Each design point has its own seeds, i.e. its own floor and noise."
-    same = f"the same {sampling.seeds} seeds" if sampling.seeds > 1 else f"the same seed ({sampling.seed})"
-    return (
-        f"All samples use {same}, so they are compared on the same floor and with the same noise; more seeds show "
-        "the variation between floors."
-    )
