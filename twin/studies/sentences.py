@@ -118,7 +118,7 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     name, unit = words(key), unit_text(key)
     constant = f"{name} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
     fraction = f"at least {percent(required)} of surveys pass"
-    parts = [f"no value of {name} is shown yet at which {fraction}"]
+    parts = [f"no value of {name} has enough surveys yet to show that {fraction}"]
     if passes:
         parts = [f"{fraction} at {name} {_labels(passes)}{unit}"]
     if fails:
