@@ -24,7 +24,7 @@ _LARGEST_Z = 4.0  # of a cell in the smoothed difference: one mismatch is no pat
 _CALM_Z = 3.0  # of a square with which the errors are fitted at first
 #: Quantile of the maxima above which their tail is fitted, and the share of those above that are errors, in each round:
 #: at first, a quarter of all maxima may be changes.
-_TAILS = (0.5, 0.5), (0.8, 0.9), (0.8, 0.9)
+_TAILS = (0.5, 0.5), (0.8, 0.5), (0.8, 0.9)
 
 
 class Patch(NamedTuple):
@@ -103,8 +103,9 @@ def change_between(first: Heights, second: Heights, scale_m: float) -> Change:
     ratio = _weighted_mean(np.nan_to_num(of_maps.difference_m), weights, side) * np.sqrt(_mean(weights, side))
     calm = np.abs(ratio) <= _CALM_Z * _normal_scale(ratio[weights > 0])
     change = _look((first, second), calm, everywhere, side, _TAILS[0])
+    calm = everywhere
     for tail in _TAILS[1:]:
-        calm = ~np.asarray(binary_dilation(change.labels > 0, iterations=(side + 1) // 2), bool)
+        calm = calm & ~np.asarray(binary_dilation(change.labels > 0, iterations=(side + 1) // 2), bool)
         change = _look((first, second), calm, calm, side, tail)
     return change
 
