@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from twin.studies.answers import (
+    Answer,
     PassRecord,
     answers_of_ranges,
     answers_of_values,
@@ -11,7 +12,8 @@ from twin.studies.answers import (
     monotone_pieces,
     regress,
 )
-from twin.studies.statistics import wilson_interval
+from twin.studies.sentences import answer_sentence
+from twin.studies.statistics import Proportion, wilson_interval
 
 
 def answers(x, passed, required=0.9):
@@ -159,3 +161,11 @@ def test_the_limit_has_the_direction_of_the_key(sign):
     assert limit is not None
     assert (limit.value, limit.rises) == (sign * 59.5, sign < 0)
     assert sorted((limit.low, limit.high)) == sorted((sign * 49, sign * 60))
+
+
+@pytest.mark.parametrize(("verdict", "text"), [("fails", "No value of speed is shown at"), ("undecided", "has enough")])
+def test_more_surveys_are_only_asked_for_where_they_could_decide(verdict, text):
+    probability = Proportion(0.5, 0.4, 0.6, 0.5)
+    answer = Answer(verdict, "0.3 to 0.5", 0.3, 0.5, 12, probability, 30.0)
+    sentence = answer_sentence("plan.speed_mps", [answer], 0.9)
+    assert text in sentence and ("more" in sentence) == (verdict == "undecided")

@@ -118,7 +118,8 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     name, unit = words(key), unit_text(key)
     constant = f"{name} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
     fraction = f"at least {percent(required)} of surveys pass"
-    parts = [f"no value of {name} has enough surveys yet to show that {fraction}"]
+    shown = "has enough surveys yet to show that" if undecided else "is shown at which"
+    parts = [f"no value of {name} {shown} {fraction}"]
     if passes:
         parts = [f"{fraction} at {name} {_labels(passes)}{unit}"]
     if fails:
