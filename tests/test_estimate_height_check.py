@@ -58,6 +58,13 @@ def test_standard_deviations_that_heights_contradict_are_multiplied_by_the_scatt
         np.testing.assert_allclose(found.repeatability_m, np.sqrt(7e-6) * max(found.scatter, 1.0), rtol=1e-5)
 
 
+def test_mismatches_in_one_set_do_not_enlarge_the_standard_deviations():
+    """3 % of the cells are 50 standard deviations off: the RMS of all would be 6."""
+    full, one, other = maps(0.7)
+    one.height_m[np.random.default_rng(1).random(one.height_m.shape) < 0.03] += np.float32(0.2)
+    assert with_scatter(full, one, other).scatter == pytest.approx(0.7, rel=0.1)
+
+
 def test_a_few_common_cells_are_no_test():
     full, one, other = maps(3.0, n_common=MIN_COMMON - 1)
     assert with_scatter(full, one, other) is full

@@ -47,6 +47,19 @@ def test_what_multiplies_or_adds_to_the_sigmas_is_in_the_parts(mapped):
     assert (scattered.scatter or 0) > 2 and sum(scattered.variances) == pytest.approx(whole(scattered), rel=1e-4)
 
 
+@pytest.mark.parametrize(("relief_m", "noise_m", "share"), [(0.0, 0.002, 0.0), (0.004, 0.0, 1.0), (0.004, 0.004, 0.5)])
+def test_roughness_that_differs_between_two_halves_is_noise_of_the_depths(mapped, relief_m, noise_m, share):
+    """The whole map has the mean of the independent noise of the halves, and their common relief."""
+    rng, shape = np.random.default_rng(5), mapped.height_m.shape
+    floor = relief_m * rng.standard_normal(shape)
+    halves = [floor + noise_m * 2**0.5 * rng.standard_normal(shape) for _ in range(2)]
+    one, other, full = (replace(mapped, height_m=h.astype(np.float32)) for h in (*halves, np.mean(halves, axis=0)))
+    before, after = mapped.variances, with_scatter(full, one, other)
+    scale = max(after.scatter or 0, 1) ** 2
+    assert after.variances.relief == pytest.approx(scale * share * before.relief, abs=0.05 * scale * before.relief)
+    assert sum(after.variances) == pytest.approx(scale * sum(before))
+
+
 def empty():
     return build_map([], KeyframePath(np.zeros((0, 4, 4)), *np.zeros((2, 0, 6, 6))), RIG, GRID)
 

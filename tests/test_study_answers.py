@@ -12,7 +12,7 @@ from twin.studies.answers import (
     monotone_pieces,
     regress,
 )
-from twin.studies.sentences import answer_sentence
+from twin.studies.sentences import answer_sentences
 from twin.studies.statistics import Proportion, wilson_interval
 
 
@@ -167,5 +167,5 @@ def test_the_limit_has_the_direction_of_the_key(sign):
 def test_more_surveys_are_only_asked_for_where_they_could_decide(verdict, text):
     probability = Proportion(0.5, 0.4, 0.6, 0.5)
     answer = Answer(verdict, "0.3 to 0.5", 0.3, 0.5, 12, probability, 30.0)
-    sentence = answer_sentence("plan.speed_mps", [answer], 0.9)
+    sentence = answer_sentences("plan.speed_mps", [answer], 0.9)
     assert text in sentence and ("more" in sentence) == (verdict == "undecided")

@@ -43,6 +43,7 @@ QUANTITIES = (
     "map.completeness", "orthomosaic.ce90_px", "control.cross_track_rmse_m", "self_check.frames_lost", "timing.frames",
     "timing.keyframes", "timing.wall_s", "timing.peak_rss_mb",
 )  # fmt: skip
+_SLIGHT = 0.01  #: difference from the first run that is neither good nor bad, relative or of a fraction
 #: Those of which neither smaller nor larger values are better.
 NEUTRAL = ("consistency.nees_position_mean", "timing.frames", "timing.keyframes")
 
@@ -221,7 +222,8 @@ def _compared(name: str, value: float | None, first: float | None) -> Cell:
     difference = value - first
     if difference == 0:
         return Cell(value, text, difference, "same")
-    level = "" if name in NEUTRAL else "good" if (difference > 0) == more_is_better(name) else "bad"
+    is_slight = abs(difference) < _SLIGHT * (1.0 if is_fraction(name) else abs(first))
+    level = "" if name in NEUTRAL or is_slight else "good" if (difference > 0) == more_is_better(name) else "bad"
     if is_fraction(name):
         return Cell(value, text, difference, f"{100 * difference:+.2g} %", level)
     change = f"{'+' if difference > 0 else '-'}{metric_value(name, abs(difference))}"

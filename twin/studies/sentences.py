@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.judge.verdict import more_is_better
-from twin.report.html import Paragraph, lines_of, render_paragraphs
+from twin.report.html import Paragraph, lines_of, render_paragraphs, render_text
 from twin.report.number_formats import DASH, metric_value, percent, unit_of
 from twin.report.words import words
 from twin.studies.analysis import StudyAnalysis, count_similar
@@ -89,58 +89,24 @@ def answer_lines(analysis: StudyAnalysis, keys: Sequence[str] | None = None) -> 
     required, limits = analysis.required_probability, analysis.key_limits
     idle = {key for key, regression in analysis.regressions.items() if not regression.worst}
     return [
-        (f"No influence of {words(key)} is shown. " if key in idle else limit_sentence(key, limits.get(key), required))
-        + answer_sentence(key, answers, required)
+        answer_sentences(key, answers, required, limits.get(key), key in idle)
         for key, answers in analysis.answers.items()
         if keys is None or key in keys
     ]
 
 
-def limit_sentence(key: str, limit: KeyLimit | None, required: float | None) -> str:
-    """Returns a sentence on the limit of a key with its confidence interval, and a space; "" if it has none."""
-    if limit is None or (np.isinf(limit.low) and np.isinf(limit.high)):
-        return ""
-    if np.isfinite([limit.low, limit.high]).all():
-        interval = f"{rounded(limit.low)} to {rounded(limit.high)}"
-    else:
-        interval = f"below {rounded(limit.high)}" if np.isfinite(limit.high) else f"above {rounded(limit.low)}"
-    value = f"is {rounded(limit.value)}{unit_text(key)}" if np.isfinite(limit.value) else "is not known"
-    side = "above" if limit.rises else "below"
-    named = f"The estimated limit of {words(key)}, {side} which {percent(required)} pass, {value}"
-    return f"{named} ({percent(LEVEL)} interval: {interval}). "
-
-
-def answer_sentence(key: str, answers: list[Answer], required: float | None) -> str:
-    """Returns a sentence on the flown values of a key at which enough surveys pass, too few, or more must be flown."""
-    passes, fails, undecided = (
-        [answer for answer in answers if answer.verdict == verdict] for verdict in ("passes", "fails", "undecided")
-    )
-    name, unit = words(key), unit_text(key)
-    constant = f"{name} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
-    fraction = f"at least {percent(required)} of surveys pass"
-    shown = "has enough surveys yet to show that" if undecided else "is shown at which"
-    parts = [f"no value of {name} {shown} {fraction}"]
-    if passes:
-        parts = [f"{fraction} at {name} {_labels(passes)}{unit}"]
-    if fails:
-        parts.append(f"fewer pass at {_labels(fails)}{unit}")
-    if undecided:
-        n, verb = sum(answer.surveys for answer in undecided), "is" if len(undecided) == 1 else "are"
-        unknown = sum(answer.unknown for answer in undecided)
-        of_them = f", {unknown} of them unknown" if unknown else ""
-        more = more_needed(undecided)
-        parts.append(f"{_labels(undecided)}{unit} {verb} not decided with {counted(n, 'survey')}{of_them} ({more})")
-    text = "; ".join(parts) + "."
-    return constant + text[:1].upper() + text[1:]
+def answer_sentences(
+    key: str, answers: list[Answer], required: float | None, limit: KeyLimit | None = None, idle: bool = False
+) -> str:
+    """Returns the limit of a key, and its flown values at which enough surveys pass, too few, or more must be flown."""
+    by_verdict = {name: [one for one in answers if one.verdict == name] for name in ("passes", "fails", "undecided")}
+    known = {"key": key, "answers": answers, "required": required, "limit": limit, "idle": idle, **by_verdict}
+    known |= {"level": LEVEL, "infinity": np.inf, "rounded": rounded, "sentences": sys.modules[__name__]}
+    return " ".join(render_text("key_answer.txt.j2", known, "twin.studies").split())
 
 
 def unit_text(key: str) -> str:
     return f" {unit_of(key)}".rstrip()
-
-
-def _labels(answers: list[Answer]) -> str:
-    *first, last = (answer.label for answer in answers)
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 def more_needed(undecided: list[Answer]) -> str:

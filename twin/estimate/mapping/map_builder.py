@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from twin.core import geometry
@@ -27,6 +28,9 @@ MAX_STEREO_SIGMA_PX = 0.5
 #: the interval of five standard deviations reaches to infinite depth.
 MAX_RELATIVE_SIGMA = 0.2
 MIN_COMMON = 200  # cells with heights from both sets that a comparison of two sets of keyframes needs
+#: Part of the cells whose heights from two sets of keyframes differ least, and the RMS of that part of a standard
+#: normal distribution. The others are mismatches in one set, most of which the map of both does not have.
+_CENTRE, _CENTRE_RMS = 0.95, 0.871
 _ONE_WAY = 0.2  # share of the keyframes in one of two directions below which a path has no legs there and back
 
 
@@ -143,13 +147,31 @@ def flown_back(positions_m: Array) -> Mask:
 
 
 def with_scatter(elevation: ElevationMap, one: ElevationMap, other: ElevationMap) -> ElevationMap:
-    """Returns a map with the RMS difference / standard deviation of heights from two sets of keyframes, on its grid."""
+    """Returns a map with the RMS difference / standard deviation of heights from two sets of keyframes, on its grid.
+
+    The part of the variance of relief that is due to noise becomes one of `HeightVariances.stereo`.
+    """
     # it multiplies the standard deviations if above 1: the scale factor of Birge (Phys. Rev. 40, 207, 1932)
-    ratio = (one.height_m - other.height_m) / np.hypot(one.sigma_m, other.sigma_m)
-    if np.isfinite(ratio).sum() < MIN_COMMON:
+    ratio = ((one.height_m - other.height_m) / np.hypot(one.sigma_m, other.sigma_m)).astype(np.float64)
+    size = np.sort(np.abs(ratio[np.isfinite(ratio)]))
+    if len(size) < MIN_COMMON:
         return elevation
-    scatter = float(np.sqrt(np.nanmean(ratio.astype(np.float64) ** 2)))
+    scatter = float(np.sqrt(np.mean(size[: int(_CENTRE * len(size))] ** 2))) / _CENTRE_RMS
     factor = max(scatter, 1.0)
-    parts = HeightVariances(*(factor**2 * part for part in elevation.variances))
+    parts, noise_share = elevation.variances, 1 - _relief_share(one.height_m, other.height_m, elevation.typical)
+    noise_m2 = parts.relief * noise_share
+    parts = parts._replace(stereo=parts.stereo + noise_m2, relief=parts.relief - noise_m2)
+    parts = HeightVariances(*(factor**2 * part for part in parts))
     common_m2, sigma_m = elevation.common_m2 * np.float32(factor**2), elevation.sigma_m * np.float32(factor)
     return replace(elevation, sigma_m=sigma_m, common_m2=common_m2, scatter=scatter, variances=parts)
+
+
+def _relief_share(one_m: Map, other_m: Map, chosen: Mask) -> float:
+    """Returns the share of a map's roughness that is relief: equal in two half maps, while noise differs.
+
+    With the relief T and the noise N of the whole map in the squared Laplacian of the heights, each half has T + 2 N.
+    """
+    one, other = (cv2.Laplacian(height_m, cv2.CV_32F).astype(np.float64) for height_m in (one_m, other_m))
+    chosen = chosen & np.isfinite(one) & np.isfinite(other)
+    relief, half = (one * other)[chosen].sum(), (one**2 + other**2)[chosen].sum() / 2
+    return float(np.clip(2 * relief / (relief + half), 0, 1)) if half > 0 else 1.0
