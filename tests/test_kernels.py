@@ -48,17 +48,17 @@ def package(tmp_path):
     return folder
 
 
+def printed(package, *arguments, **environment):
+    """Returns the words that Python prints in a new process."""
+    cache = {"NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(package.parents[1] / "cache")}
+    command, variables = [sys.executable, "-B", *arguments], {**os.environ, **cache, **environment}
+    done = subprocess.run(command, cwd=package.parent, env=variables, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
 def run(package, **environment):
     """Returns what the caller gives for 8, and how often its code came from the disk, in a new process."""
-    variables = {
-        **os.environ,
-        "NUMBA_CACHE_DIR": "",
-        "XDG_CACHE_HOME": str(package.parents[1] / "cache"),
-        **environment,
-    }
-    command = [sys.executable, "-B", "-m", "twin.caller"]
-    done = subprocess.run(command, cwd=package.parent, env=variables, capture_output=True, text=True, check=True)
-    value, hits = done.stdout.split()
+    value, hits = printed(package, "-m", "twin.caller", **environment)
     return float(value), int(hits)
 
 
@@ -80,6 +80,15 @@ def test_an_edit_of_a_called_function_or_of_a_constant_in_another_file_is_seen(p
     assert run(package) == (-4.5, 0)
     replace(package / "constants.py", "2.5", "0.5")
     assert run(package) == (-6.5, 1)
+
+
+def test_whether_a_module_has_compiled_code_is_known_without_its_import(package):
+    command = "-c", "from twin.kernels import has_code; print(has_code('twin.callee'))"
+    assert printed(package, *command) == ["False"]
+    run(package)
+    assert printed(package, *command) == ["True"]
+    replace(package / "constants.py", "0.5", "2.5")
+    assert printed(package, *command) == ["False"]
 
 
 def test_two_checkouts_of_the_same_sources_share_the_compiled_code(package):

@@ -666,6 +666,7 @@ def _run_survey(
 
     # last, because two surveys that begin at once must find different folders
     folder = outputs.run_folder(scenario, resume) if out is None else outputs.new_folder(out, used=resume)
+    console.note_first_use(scenario.imaging.fidelity)
     with console.progress_bar() as progress:
         return survey.run(scenario, folder, progress, live, resume=resume, checkpoint_s=checkpoint_s)
 

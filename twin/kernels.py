@@ -114,6 +114,12 @@ def cache_folder(file: Path, name: str) -> Path | None:
     return folder
 
 
+def has_code(module: str) -> bool:
+    """Returns whether compiled code of a module of the project is kept on disk."""
+    folder = cache_folder(file, module) if (file := _file_of(module)) else None
+    return folder is not None and any(folder.glob("*.nbc"))
+
+
 def _module_name(file: Path) -> str:
     """Returns the dotted name of a module of the project, or the file's name for one outside of it."""
     inside = file.is_relative_to(_ROOT)

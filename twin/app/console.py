@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from twin.session.monitor import SurveyProgress
 
 _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EIO, errno.EROFS)
+_COMPILED_LATE = {"rendered": "twin.estimate.mapping.orthophoto", "surrogate": "twin.surrogate.sampling"}
 _ADDRESS_SPACE = 3_000_000_000  # smallest limit under which a small survey ends [bytes]
 
 
@@ -94,6 +95,14 @@ def _bar(task: str, *columns: TextColumn) -> Iterator[Callable[..., None]]:
     with Bar(TextColumn("{task.description:>7}"), BarColumn(), TaskProgressColumn(), *columns, console=console) as bar:
         shown = bar.add_task(task, total=1.0, note="")
         yield lambda **fields: bar.update(shown, **fields)
+
+
+def note_first_use(fidelity: str) -> None:
+    """Prints a note on stderr if the code of a survey is still to be compiled."""
+    from twin.kernels import has_code
+
+    if not has_code(_COMPILED_LATE[fidelity]):
+        print_error(f"The first {fidelity} survey on this computer compiles its code, for two to four minutes.")
 
 
 @contextmanager

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,6 +53,9 @@ class StudyOptions(NamedTuple):
 @contextmanager
 def _fleet(options: StudyOptions, scenarios: Iterator[Scenario]) -> Iterator[Fleet]:
     """Yields the workers; `scenarios` are some of those to fly, for the time that a survey needs at least."""
+    if first := next(scenarios, None):
+        console.note_first_use(first.imaging.fidelity)
+        scenarios = chain([first], scenarios)
     end_s = time.time() + _budget_s(options.budget, scenarios) if options.budget else math.inf
     with open_engine(options.jobs, options.scheduler) as engine, study_progress(options.live, end_s) as progress:
         yield Fleet(engine, progress, end_s=end_s)

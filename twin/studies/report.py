@@ -70,7 +70,7 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
                 "agrees": compared.agrees,
                 "pairs": compared.pairs,
                 "verdicts": compared.verdicts._asdict() | {"agrees": compared.verdicts_agree},
-                "metrics": {one.metric: _metric(one) for one in compared.metrics},
+                "metrics": {one.metric: one._asdict() | {"agrees": one.agrees} for one in compared.metrics},
             },
             "answers": analysis.answers,
             "key_limits": analysis.key_limits,
@@ -84,10 +84,6 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
             "warnings": analysis.warning_counts,
         }
     )
-
-
-def _metric(one: agreement.MetricAgreement) -> dict[str, Any]:
-    return {name: value for name, value in one._asdict().items() if name != "metric"} | {"agrees": one.agrees}
 
 
 def json_tree(value: Any) -> Any:

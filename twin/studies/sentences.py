@@ -17,10 +17,6 @@ from twin.studies.influence import influences
 from twin.studies.statistics import LEVEL, Interval, Proportion
 
 
-def metric_heading(metric: str) -> str:
-    return words(metric)[:1].upper() + words(metric)[1:]
-
-
 def metric_interval(metric: str, interval: Interval) -> str:
     """Returns the estimate of a metric, with its confidence interval in brackets if it has one."""
     value, low, high = ("unbounded" if np.isinf(number) else metric_value(metric, number) for number in interval)
