@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import types
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -180,6 +181,16 @@ def test_the_plan_as_json_is_one_object_and_nothing_else(twin_command, tmp_path)
 def test_progress_shows_simulated_time_real_time_factor_and_position_error():
     now = types.SimpleNamespace(simulated_s=30.0, wall_s=20.0, share=0.5, sigma_m=0.013, stage="survey")
     assert console.progress_note(now) == "30.0 s simulated, 1.50 x real time, position ± 1.3 cm"
+
+
+@pytest.mark.parametrize("fidelity", ["rendered", "surrogate"])
+def test_the_first_use_is_noted_where_the_code_is_not_compiled(fidelity, capsys, monkeypatch):
+    monkeypatch.setattr("twin.kernels.has_code", lambda module: False)
+    console.note_first_use(fidelity)
+    assert f"The first {fidelity} survey" in capsys.readouterr().err
+    monkeypatch.setattr("twin.kernels.has_code", lambda module: find_spec(module) is not None)  # a module that exists
+    console.note_first_use(fidelity)
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_pipe_gets_no_progress_bar(capsys):

@@ -53,6 +53,15 @@ def test_differences_are_those_from_the_first_run_and_better_is_told_from_worse(
     assert (third.value, third.difference, third.level) == (None, None, "")
 
 
+def test_a_difference_below_one_percent_is_neither_good_nor_bad(tmp_path):
+    first = write_run(tmp_path / "one", 0.002, 0.9, seed=1)
+    second = write_run(tmp_path / "two", 0.002 * 1.009, 0.909, seed=1)
+    runs = run_comparison.load_runs([first, second])
+    for name in ("trajectory.final.ate_rmse_m", "map.completeness"):
+        changed = row(runs, name)[1]
+        assert changed.change not in ("", "same") and changed.level == ""
+
+
 def test_a_quantity_that_no_run_has_is_left_out(runs):
     assert "map.le90_m" not in [row.name for row in run_comparison.table(runs)]
 

@@ -102,7 +102,7 @@ def note_first_use(fidelity: str) -> None:
     from twin.kernels import has_code
 
     if not has_code(_COMPILED_LATE[fidelity]):
-        print_error(f"The first {fidelity} survey on this computer compiles its code, for two to four minutes.")
+        print_error(f"The first {fidelity} survey on this computer compiles its code, which takes some minutes.")
 
 
 @contextmanager

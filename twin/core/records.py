@@ -395,7 +395,7 @@ class ElevationMap:
     mosaic: Image  #: (rows, cols, 3) uint8 RGB orthomosaic, black where unknown
     #: (4, 4) pose of the world in the map frame; the identity for a rig that looks down.
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
-    #: RMS of the differences of heights from two disjoint sets of keyframes / their standard deviation; None: unknown.
+    #: RMS difference of heights from two sets of keyframes / its sigma, without the largest 5 %; None: unknown.
     scatter: float | None = None
     #: (rows, cols) part of sigma_m squared that is equal in two surveys of a floor [m^2]; negative: they differ more.
     common_m2: NDArray[np.float32] | float = 0.0
