@@ -3,7 +3,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PARALLEL := -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: env demo test long slow bench docs agreement
+.PHONY: env demo test fast long slow bench docs agreement
 
 env: $(READY) ## set up: a virtual environment with exact versions
 
@@ -22,6 +22,9 @@ test: env ## style, types and the fast tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+	$(MAKE) fast
+
+fast: env ## the fast tests
 	$(BIN)/python -m pytest $(PARALLEL)
 
 long: env ## small surveys, their reports and Monte Carlo references: tests of seconds each

@@ -25,6 +25,7 @@ from twin.survey import fly
 from twin.world.mission import Mission, prepare
 
 SMALL = ("plan.tracks=1", "plan.area_m=[0.8,0.8]", "control.hold_s=0.5")  #: a survey of 11 s
+_PLAIN = "mujoco.Renderer, same views"
 _SGBM, _FLOW = "cv2.StereoSGBM, three-way", "cv2.calcOpticalFlowPyrLK, as many points"
 #: Unit and floor of each stage of the stopwatch.
 _STAGES = {
@@ -36,9 +37,10 @@ _Flown = list[tuple[Frame, Array, Array]]  # with pose of the left camera and tw
 
 
 def stage_rows(progress: Callable[[float], None]) -> list[BenchmarkRow]:
-    """Returns the rows of all stages: each round renders the images of one flight again, and estimates from them."""
+    """Returns the rows of all stages and of their sums; a round renders the images of one flight, and estimates."""
     watch, mission, flown = Stopwatch(time.process_time), prepare(load_scenario("reef", SMALL)), _Flown()
     rounds: dict[str, list[Array]] = {stage: [] for stage in _STAGES}
+    sums = list[list[float]]()  # of all stages, of their floors, and of plain rendering
     with PlainRenderer(mission.terrain, mission.rig) as plain, open_world(mission, watch) as world:
         camera: Any = world.camera  # pyright: ignore[reportAttributeAccessIssue] (of a rendered world)
 
@@ -51,16 +53,19 @@ def stage_rows(progress: Callable[[float], None]) -> list[BenchmarkRow]:
             for frame, pose, twist_body in flown:
                 camera.capture(pose, frame.right is not None, twist_body)
             result = _estimate(mission, watch, lambda navigator: [navigator.update(frame) for frame, *_ in flown])
-            for stage, works in _floors(mission, flown, result, plain).items():
-                ms = sum(watch.durations_ms(stage)[done[stage] :]), sum(map(processor_ms, works))
-                rounds[stage].append(np.array(ms) / len(works))
+            works_of, ms = _floors(mission, flown, result, plain), dict[str, tuple[float, float]]()
+            for stage, works in works_of.items():
+                ms[stage] = sum(watch.durations_ms(stage)[done[stage] :]), sum(map(processor_ms, works))
+                rounds[stage].append(np.array(ms[stage]) / len(works))
+            sums.append([*map(sum, zip(*ms.values(), strict=True)), ms["render"][1]])
             progress((k + 1) / N_ROUNDS)
     scales = {"ns a pixel": 1e6 / (mission.rig.width_px * mission.rig.height_px)}
     rows = []
     for stage, (unit, floor) in _STAGES.items():
         values, floors = scales.get(unit, 1.0) * np.array(rounds[stage]).T
         rows.append(BenchmarkRow(stage, unit, values, floor, floors))
-    return rows
+    whole = zip(("all stages", "floors of all stages"), np.array(sums).T, strict=False)
+    return [*rows, *(BenchmarkRow(name, "ms a survey", ms, _PLAIN, np.array(sums).T[2]) for name, ms in whole)]
 
 
 def _estimate(mission: Mission, watch: Stopwatch, run: Callable[[Any], object]) -> SurveyResult:

@@ -45,7 +45,7 @@ def _survey(scene: str, overrides: Sequence[str]) -> list[float]:
     mission, results = prepare(scenario), []
     with TemporaryDirectory(prefix="twin-") as temporary, PlainRenderer(mission.terrain, mission.rig) as plain:
         folder = Path(temporary) / "run"
-        survey_ms = processor_ms(lambda: results.append(survey.run(scenario, folder)))
+        survey_ms = processor_ms(lambda: results.append(survey.run(scenario, folder, outputs=())))
         run, metrics = results[0].contents, results[0].metrics
         size_mb = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e6
         poses = run.trajectories["truth"].world_from_camera
