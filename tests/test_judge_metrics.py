@@ -9,9 +9,11 @@ import pytest
 from judge_synthetic import SCENARIO, evaluated, survey
 
 from twin.core import geometry
+from twin.core.height_field import image_overlap
 from twin.core.links import Links
 from twin.core.records import ElevationMap, MapGrid, Trajectory, Truth
 from twin.errors import TwinError
+from twin.judge import swaths
 from twin.judge.consistency import consistency_metrics, nees, nees_interval
 from twin.judge.map_error import map_metrics
 from twin.judge.metrics import EvaluationInput, check_require, empty_metrics, evaluate
@@ -169,6 +171,16 @@ def test_overlap_decreases_where_the_floor_rises():
     low, raised = (overlap_metrics(RESULT, t, RIG, ELEVATION.grid, {}) for t in (TRUTH, high))
     assert raised["across_median"] < low["across_median"] - 0.1
     assert raised["along_median"] < low["along_median"] - 0.05
+
+
+def test_overlap_of_a_long_survey_is_measured_from_a_sample_of_pairs_over_the_whole_path(monkeypatch):
+    whole, numbers = overlap_metrics(RESULT, TRUTH, RIG, ELEVATION.grid, {}), []
+    monkeypatch.setattr(swaths, "MOST_PAIRS", 20)
+    monkeypatch.setattr(swaths, "image_overlap", lambda f, *p: numbers.append(len(p[0])) or image_overlap(f, *p))
+    sample = overlap_metrics(RESULT, TRUTH, RIG, ELEVATION.grid, {})
+    assert numbers == [20, 20]
+    for key in ("along_median", "across_median"):
+        assert sample[key] == pytest.approx(whole[key], abs=0.02)
 
 
 def diagonal_swaths(spacing_m):

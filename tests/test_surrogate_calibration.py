@@ -106,7 +106,7 @@ def test_pitch_roll_and_row_offset_are_removed_and_yaw_is_not():
     np.testing.assert_allclose(view.removed, given, atol=np.deg2rad(0.001))
     points = floor_points(rig)
     without_yaw, _, _ = view_of(*sets[:2], "calibration_error.right_principal_point_error_px=[0.0,0.5]")
-    rows_px = [v.row_difference(points) * rig.focal_px for v in (view, without_yaw)]
+    rows_px = [v.measure_with_rows(points)[:, 3] * rig.focal_px for v in (view, without_yaw)]
     yaw_rows_px = np.deg2rad(0.05) * points[:, 0] * points[:, 1] * rig.focal_px
     assert np.abs(rows_px[1]).max() < 0.01
     assert rows_px[0].std() == pytest.approx(yaw_rows_px.std(), rel=0.2)

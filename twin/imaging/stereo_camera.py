@@ -169,12 +169,13 @@ def light_after_lens(
     focal_px: float,
     motion: ExposureMotion | None,
     snow: bool = True,
+    before: Radiance | None = None,
 ) -> Radiance:
-    """Returns the light (H, W, 3) of a view behind the lens of a moving camera.
+    """Returns the light (H, W, 3) of a view behind the lens of a moving camera, given that `before` the lens if known.
 
     Marine snow, which has other depths and velocities, is drawn with its own blur after lens and motion.
     """
-    light = psf.out_of_focus(formation.radiance_without_snow(view), view.depth)
+    light = psf.out_of_focus(formation.radiance_without_snow(view) if before is None else before, view.depth)
     if motion is not None:
         light = integrate(light, view.depth, focal_px, motion)
     if snow:

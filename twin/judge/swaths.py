@@ -20,6 +20,7 @@ from twin.judge.summary_statistics import finite_float, percentile, rms
 ON_LEG_COSINE = 0.9
 #: Change of the planned heading between two frames above which they belong to a turn [rad].
 TURNING_STEP = 1e-9
+MOST_PAIRS = 500  #: largest number of pairs of images, evenly along the path, from which an overlap is measured
 
 
 def travel_direction(reference: Array) -> Array:
@@ -129,10 +130,15 @@ class ImagePairs(NamedTuple):
     second: Array
 
 
+def thinned(pairs: ImagePairs, most: int) -> ImagePairs:
+    kept = np.unique(np.linspace(0, len(pairs.first) - 1, min(most, len(pairs.first))).astype(int))
+    return ImagePairs(pairs.first[kept], pairs.second[kept])
+
+
 def overlap_metrics(
     result: SurveyResult, truth: Truth, rig: StereoRig, grid: MapGrid | None, planned: Mapping[str, Any]
 ) -> dict[str, float | None]:
-    """Returns `overlap.*` of metrics.json.
+    """Returns `overlap.*` of metrics.json, from `MOST_PAIRS` pairs of each direction.
 
     Args:
         grid: cells of `truth.height_m`; None: the floor is taken to be level, at the mean height.
@@ -147,7 +153,7 @@ def overlap_metrics(
     field, found = _true_floor(truth, grid), {}
     both = image_pairs(poses, planned.get("both_ways", False))
     for direction, pairs in zip(("along", "across"), both, strict=True):
-        overlap = np.zeros(0) if field is None else image_overlap(field, pairs.first, pairs.second, rig)
+        overlap = np.zeros(0) if field is None else image_overlap(field, *thinned(pairs, MOST_PAIRS), rig)
         overlap = overlap[np.isfinite(overlap)]  # not finite if the first image shows no floor
         found |= {
             f"{direction}_asked": finite_float(planned.get(f"overlap_{direction}")),

@@ -100,8 +100,8 @@ class FloorImages:
 
     def matched(self, albedo: Image, depth_m: float, rng: np.random.Generator) -> MatchedImages:
         view, even = self._level_floor(albedo, depth_m), self._level_floor(_mean_colour(albedo), depth_m)
-        sensor, setting = self._metered(view)
-        light = self._recorded(view, sensor, setting)
+        sensor, setting, before = self._metered(view)
+        light = self._recorded(view, sensor, setting, before=before)
         signal = sensor.levels(light, setting) - sensor.levels(self._recorded(even, sensor, setting), setting)
         first, second = (sensor.image(light, setting, rng).astype(np.float32) for _ in range(2))
         return MatchedImages(signal, first - second)
@@ -121,22 +121,28 @@ class FloorImages:
         """Returns noise-free images (H, W, 3) of a floor without snow, and the same with different particles."""
         view = self._level_floor(albedo, depth_m)
         views = [view._replace(pose=shifted) for shifted in snow_poses(view.pose)]
-        sensor, setting = self._metered(view)
+        sensor, setting, _ = self._metered(view)
         return [
             [sensor.levels(self._recorded(one, sensor, setting, snow), setting) for one in views]
             for snow in (False, True)
         ]
 
-    def _metered(self, view: RenderedView) -> tuple[Sensor, ExposureSetting]:
-        sensor = sensor_of(self.scenario, self.rig)
-        return sensor, sensor.meter(self._formation.radiance(view))
+    def _metered(self, view: RenderedView) -> tuple[Sensor, ExposureSetting, Radiance]:
+        """Returns the sensor, its exposure of a view with snow, and the light (H, W, 3) of the view without snow."""
+        sensor, light = sensor_of(self.scenario, self.rig), self._formation.radiance_without_snow(view)
+        with_snow = light.copy()
+        self._formation.add_snow(with_snow, view)
+        return sensor, sensor.meter(with_snow), light
 
-    def _recorded(self, view: RenderedView, sensor: Sensor, setting: ExposureSetting, snow: bool = False) -> Radiance:
+    def _recorded(
+        self, view: RenderedView, sensor: Sensor, setting: ExposureSetting, snow: bool = False,
+        before: Radiance | None = None,
+    ) -> Radiance:  # fmt: skip
         """Returns the light (H, W, 3) on the sensor of the camera, which moves with the planned speed."""
         motion = sensor.motion(self._twist, setting, len(view.depth))
         if motion is not None:
             motion = motion._replace(rolls_later=True)  # the estimators correct the readout
-        return light_after_lens(self._formation, self._psf, view, self.rig.focal_px, motion, snow)
+        return light_after_lens(self._formation, self._psf, view, self.rig.focal_px, motion, snow, before)
 
     def _level_floor(self, albedo: Image, depth_m: float) -> RenderedView:
         world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, self.scenario.plan.altitude_m]))

@@ -30,6 +30,8 @@ from twin.kernels import kernel
 _SHAPE = (5, 31, 41)  # grid points along disparity, y and x
 _MARGIN = 1.3  # extent of the grid, in units of the image
 _STEP_DEPTHS = 0.01  # step of the camera for the numerical Jacobian of the image motion, in units of depth and in rad
+#: (6, 3, 3) rotations of the camera by this step and back, about x, y and z; a row vector times one is turned back.
+_TURNED = np.array([geometry.so3_exp(step) for step in _STEP_DEPTHS * np.concatenate([np.eye(3), -np.eye(3)])])
 _FIT_ITERATIONS = 3
 _INVERSE_ITERATIONS = 8
 
@@ -64,9 +66,9 @@ class MeasuredView(NamedTuple):
         """Returns the measured positions (n, 3) of true points (n, 3); NaN for points that are not imaged."""
         return np.ascontiguousarray(_measure_all(self.table, points)[:, :3])
 
-    def row_difference(self, points: Array) -> Array:
-        """Returns the remaining row differences (n,), right minus left, of true points (n, 3)."""
-        return _measure_all(self.table, points)[:, 3]
+    def measure_with_rows(self, points: Array) -> Array:
+        """Returns, like `measure`, positions and remaining row differences, right minus left, (n, 4)."""
+        return _measure_all(self.table, points)
 
     def true_directions(self, measured_xy: Array, disparity: float) -> Array:
         """Returns the true (x, y) (n, 2) of points at a true disparity that are measured at `measured_xy`."""
@@ -162,8 +164,9 @@ def _flow(points: Array, baseline_m: float, image_of) -> Array:
     depth_m = baseline_m / points[:, 2:]
     xyz = np.column_stack([points[:, :2], np.ones(len(points))]) * depth_m
     scale = _STEP_DEPTHS * np.append(np.ones(3), np.full(3, float(np.median(depth_m))))
-    steps = [sign * step for sign in (1.0, -1.0) for step in np.diag(scale)]
-    moved = np.concatenate([geometry.transform(geometry.inverse(geometry.exp(step)), xyz) for step in steps])
+    shifts = np.concatenate([-np.diag(scale[3:]), np.diag(scale[3:])]).reshape(2, 3, 1, 3)
+    turned = (xyz @ _TURNED).reshape(2, 3, -1, 3)
+    moved = np.concatenate([turned, xyz + shifts], axis=1).reshape(-1, 3)
     images = image_of(np.column_stack([moved[:, :2] / moved[:, 2:], baseline_m / moved[:, 2]]))
     ahead, back = images.reshape(2, len(scale), 2 * len(points))
     return ((ahead - back) / (2 * scale[:, None])).T
@@ -237,7 +240,7 @@ class MeasuredRows:
 
     def are_matched(self, points: Array) -> NDArray[np.bool_]:
         """Returns the mask (n,) of the true points (n, 3) whose measured positions satisfy the epipolar constraint."""
-        return stereo.satisfies_epipolar(*self._positions_px(points))
+        return stereo.satisfies_epipolar(*self._positions_px(self._view.measure_with_rows(points)))
 
     def observe(
         self, observation: StereoObservation, points: Array, sigma_px: float
@@ -245,31 +248,33 @@ class MeasuredRows:
         """Adds the row differences of a stereo pair; returns the observation with statistics, and a noise ratio."""
         # the ratio of `stereo.row_noise_ratio`, but for any number of points; `points` (n, 3) are true ones that
         # represent `observation.n_points` matches, `sigma_px` is the standard deviation of a match in one image [px]
-        rows_px, row_sigma_px = self._view.row_difference(points) * self._rig.focal_px, np.sqrt(2) * sigma_px
-        of_raster = row_sigma_px * np.sqrt(len(points) / observation.n_points)
-        self._add(points, rows_px + of_raster * self._rng.standard_normal(len(points)), of_raster)
-        scatter_px = _MAD_TO_SIGMA * np.median(np.abs(rows_px - np.median(rows_px)))
-        spread_px = float(np.hypot(row_sigma_px, scatter_px))
+        measured, row_sigma_px = self._view.measure_with_rows(points), np.sqrt(2) * sigma_px
+        rows_px, of_raster = (
+            measured[:, 3] * self._rig.focal_px,
+            row_sigma_px * np.sqrt(len(points) / observation.n_points),
+        )
+        self._add(measured, rows_px + of_raster * self._rng.standard_normal(len(points)), of_raster)
+        offset_px = float(np.median(rows_px))
+        spread_px = float(np.hypot(row_sigma_px, _MAD_TO_SIGMA * np.median(np.abs(rows_px - offset_px))))
         ratio = spread_px / row_sigma_px
         described = observation._replace(
-            row_offset_px=float(np.median(rows_px)), row_spread_px=spread_px, row_sigma_px=float(row_sigma_px)
+            row_offset_px=offset_px, row_spread_px=spread_px, row_sigma_px=float(row_sigma_px)
         )
         return described, ratio if ratio > 1 + _SIGNIFICANT / np.sqrt(observation.n_points) else 1.0
 
     def report(self) -> EpipolarError:
         return self._calibration.report()
 
-    def _add(self, points: Array, rows_px: Array, sigma_px: float) -> None:
-        """Updates the estimate of the rectification errors with the row differences (n,) of true points (n, 3)."""
-        n, (left, _) = len(points), self._positions_px(points)
-        cov = np.tile(np.eye(3) * (sigma_px / 2 / self._rig.focal_px) ** 2, (n, 1, 1))
-        measured, zeros = self._view.measure(points), np.zeros((n, 2))
-        pair = StereoPoints(left.astype(np.float32), zeros, zeros[:, 0], measured, cov, np.zeros((n, 3)), rows_px)
+    def _add(self, measured: Array, rows_px: Array, sigma_px: float) -> None:
+        """Updates the estimate of the rectification errors with the row differences (n,) of points (n, 4)."""
+        n, (left, _) = len(measured), self._positions_px(measured)
+        cov = np.broadcast_to(np.eye(3) * (sigma_px / 2 / self._rig.focal_px) ** 2, (n, 3, 3))
+        zeros = np.zeros((n, 3))
+        pair = StereoPoints(left.astype(np.float32), zeros, zeros[:, 0], measured[:, :3], cov, zeros, rows_px)
         self._calibration.add(pair, self._rig, self._patch_px)
 
-    def _positions_px(self, points: Array) -> tuple[Array, Array]:
-        measured, rows = self._view.measure(points), self._view.row_difference(points)
+    def _positions_px(self, measured: Array) -> tuple[Array, Array]:
+        """Returns columns and rows (n, 2) in the left and the right image of points (n, 4), see `measure_with_rows`."""
+        x, y, disparity, rows = measured.T * self._rig.focal_px
         centre = [self._rig.cx_px, self._rig.cy_px]
-        left = np.column_stack([measured[:, 0], measured[:, 1] - rows / 2])
-        right = np.column_stack([measured[:, 0] - measured[:, 2], measured[:, 1] + rows / 2])
-        return left * self._rig.focal_px + centre, right * self._rig.focal_px + centre
+        return np.stack([x, y - rows / 2], axis=1) + centre, np.stack([x - disparity, y + rows / 2], axis=1) + centre

@@ -8,11 +8,11 @@ import numpy as np
 from twin.core.geometry import Array
 from twin.core.height_field import RAY_COLUMNS, HeightField, cast_pixels, image_overlap, ray_grid
 from twin.core.records import MapGrid
-from twin.judge.swaths import KeyframePoses, image_pairs
+from twin.judge.swaths import KeyframePoses, image_pairs, thinned
 from twin.terrains import Terrain
 from twin.world.mission import Mission
 from twin.world.observed_cells import seen_over
-from twin.world.planning import floor_of, planned_keyframes, thinned
+from twin.world.planning import floor_of, planned_keyframes
 from twin.world.top_surface import with_objects
 
 _OVERLAP_PAIRS = 1000  #: largest number of pairs from which a median overlap is forecast

@@ -15,7 +15,7 @@ from twin.core.geometry import Array
 from twin.core.height_field import HeightField, height_field, image_overlap
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
-from twin.judge.swaths import ImagePairs, KeyframePoses, image_pairs, swath_numbers, travel_direction
+from twin.judge.swaths import KeyframePoses, image_pairs, swath_numbers, thinned, travel_direction
 from twin.scenario.model import PlanConfig, Scenario, VehicleConfig
 from twin.simulate.steady_flight import minimum_speed_mps, turning_radius_m
 from twin.terrains import Terrain
@@ -300,11 +300,6 @@ def planned_keyframes(plan: SurveyPlan, pattern: str) -> KeyframePoses:
     poses[:, :3, :3] = geometry.rotations_of_down_camera(yaw[keyframe])
     poses[:, :3, 3] = position[keyframe]
     return KeyframePoses(poses, travel_direction(position)[keyframe], swath[keyframe])
-
-
-def thinned(pairs: ImagePairs, most: int) -> ImagePairs:
-    kept = np.unique(np.linspace(0, len(pairs.first) - 1, min(most, len(pairs.first))).astype(int))
-    return ImagePairs(pairs.first[kept], pairs.second[kept])
 
 
 def floor_of(terrain: Terrain) -> HeightField:

@@ -20,6 +20,7 @@ from twin.core.quality import EpipolarError
 from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import StereoPoints
+from twin.kernels import kernel
 
 CORRECTED = np.array([True, False, True, True])  #: the estimates that are removed from right images
 #: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times those of a poor calibration.
@@ -43,6 +44,24 @@ def _pattern(regions: Array, estimate: Array) -> float:
     return float(np.sqrt(max(excess, 0.0) / np.sum(weight))) if len(weight) else 0.0
 
 
+@kernel
+def _robust_weights(jacobian, rows, sigma, inflation, information, vector):
+    """Returns the weights (n,) of normalised row differences in the estimate, on which they depend themselves."""
+    estimate, weight = np.linalg.solve(information, vector), np.empty(len(rows))
+    for _ in range(_ITERATIONS):
+        size = np.abs(rows - jacobian @ estimate) / sigma
+        scale = max(1.0, _MAD_TO_SIGMA * np.median(size))
+        matrix, right = information.copy(), vector.copy()
+        for i in range(len(rows)):
+            weight[i] = min(1.0, _HUBER * scale / max(size[i], 1e-12)) / (scale * sigma[i]) ** 2 / inflation
+            for p in range(4):
+                right[p] += weight[i] * jacobian[i, p] * rows[i]
+                for q in range(4):
+                    matrix[p, q] += weight[i] * jacobian[i, p] * jacobian[i, q]
+        estimate = np.linalg.solve(matrix, right)
+    return weight
+
+
 class EpipolarCalibration:
     """Errors of the rectification, estimated from all stereo pairs so far (recursive weighted least squares).
 
@@ -61,13 +80,7 @@ class EpipolarCalibration:
         jacobian = row_jacobian(x, y)
         rows = points.row_difference_px / rig.focal_px + jacobian @ self.removed
         sigma, inflation = row_sigma(points), matching.variance_inflation(points.pixels, patch_px)
-        estimate, weight = self.estimate, 1 / sigma**2
-        for _ in range(_ITERATIONS):  # the robust weights depend on the estimate, so both are iterated
-            size = np.abs(rows - jacobian @ estimate) / sigma
-            scale = max(1.0, _MAD_TO_SIGMA * float(np.median(size)))
-            weight = np.minimum(1.0, _HUBER * scale / np.maximum(size, 1e-12)) / (scale * sigma) ** 2 / inflation
-            information = self._information + jacobian.T @ (weight[:, None] * jacobian)
-            estimate = np.linalg.solve(information, self._vector + jacobian.T @ (weight * rows))
+        weight = _robust_weights(jacobian, rows, sigma, inflation, self._information, self._vector)
         self._information = self._information + jacobian.T @ (weight[:, None] * jacobian)
         self._vector = self._vector + jacobian.T @ (weight * rows)
         terms, sums = np.column_stack([weight, weight * rows, weight[:, None] * jacobian]), np.zeros_like(self._regions)
