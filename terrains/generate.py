@@ -10,7 +10,7 @@ from twin.errors import TwinError
 from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.noise import fractal_field
 from twin.terrains.terrain import Terrain, texture_shape
-from twin.terrains.textures import TextureSource, generate_texture
+from twin.terrains.textures import TextureSource, painted_texture
 from twin.terrains.walls import walls_of
 
 Heights = NDArray[np.float32]
@@ -55,8 +55,8 @@ def generate_from(
     columns, rows = np.arange(nx, dtype=np.float64), np.arange(ny, dtype=np.float64)
     height_m = np.asarray(heights(west_m + grid_m * columns, south_m + grid_m * rows, shape_rng), np.float32)
     texel_m = (nx - 1) * grid_m / shape[1]
-    texels = generate_texture(cover, height_m, shape, texel_m, texture_rng)
-    walls = walls_of(height_m, grid_m, texture, cover, texel_m, texture_rng)
+    texels = painted_texture(cover, height_m, shape, texel_m, texture_rng)
+    walls = walls_of(height_m, grid_m, texture, cover, texel_m, texels)
     return Terrain(height_m, grid_m, west_m, south_m, texels, texel_m, walls=walls)
 
 

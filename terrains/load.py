@@ -11,8 +11,8 @@ from twin.core.user_files import reading
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, decoded, height_error
 from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
-from twin.terrains.terrain import InputStatement, Terrain, texture_shape
-from twin.terrains.textures import TextureSource, generate_texture, texture_from_photo
+from twin.terrains.terrain import InputStatement, PaintedTexture, Terrain, texture_shape
+from twin.terrains.textures import TextureSource, painted_texture, texture_from_photo
 from twin.terrains.vertical_axis import Direction, HeightFile, VerticalAxis, direction_of
 from twin.terrains.walls import walls_of
 
@@ -56,19 +56,20 @@ def load(
     shape = texture_shape((ny, nx), spacing_m, texture.texel_m(extent_m) if texture.in_images else spacing_m)
     texel_m = extent_m[0] / shape[1]
     cover, rng = texture.cover or DEFAULT_COVERS["file"], np.random.default_rng(seed)
+    painted = texels = painted_texture(cover, height_m, shape, texel_m, rng)
+    colours = f"generated: {cover}"
     if texture.photo_file is not None:
         texels, colours = texture_from_photo(texture, shape, extent_m), Path(texture.photo_file).name
-    else:
-        texels, colours = generate_texture(cover, height_m, shape, texel_m, rng), f"generated: {cover}"
     covered = share = None
     if texture.orthophoto_file is not None:
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
         from twin.terrains.draped_orthophoto import lay_orthophoto
 
+        texels = texels.image if isinstance(texels, PaintedTexture) else texels
         covered = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
         share = float(covered.mean())
         colours = f"{Path(texture.orthophoto_file).name} over {100 * share:.3g} % of the floor, else {colours}"
-    walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
+    walls = walls_of(height_m, spacing_m, texture, cover, texel_m, painted, covered)
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
     filled = None if has_height.all() else ~has_height
     finite = given.values[np.isfinite(given.values)]

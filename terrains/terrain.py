@@ -1,6 +1,8 @@
 """Seafloor model: a triangulated height grid with a texture."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twin.core.geometry import Array
 from twin.core.georeference import Georeference
+from twin.core.records import Image
 from twin.errors import TwinError
 
 
@@ -38,6 +41,19 @@ MAX_NODES = 6_000_000
 MAX_TEXELS = 250_000_000
 
 
+@dataclass(frozen=True)
+class PaintedTexture:
+    """Texture that is painted when its image is first asked for: plans and surrogate surveys need none."""
+
+    shape: tuple[int, int, int]  #: (h, w, 3) of the image
+    paint: Callable[[], Image]
+    rng: np.random.Generator  #: from which `paint` takes random numbers
+
+    @cached_property
+    def image(self) -> Image:
+        return self.paint()
+
+
 class Walls(NamedTuple):
     """Texture of the walls of a floor, and its weights (module `walls`).
 
@@ -51,7 +67,7 @@ class Walls(NamedTuple):
     #: (n, 2, 2, 2) float32 weights at the corners of a cell: south and north, west and east, projection along x and y;
     #: the rest to 1 is the weight of the texture of the floor
     weights: NDArray[np.float32]
-    texture: NDArray[np.uint8]  #: (h, w, 3) uint8 RGB albedo; rows run down from the highest to the lowest point
+    texture: PaintedTexture  #: (h, w, 3) uint8 RGB albedo; rows run down from the highest to the lowest point
     length_m: float  #: length of the texture along its columns, the longer side of the floor
     low_m: float  #: heights of the lower and the upper edge of the texture
     high_m: float
@@ -69,7 +85,7 @@ class Terrain:
     spacing_m: float  #: distance between neighbouring nodes along x and y
     west_m: float  #: position of node (0, 0), as `south_m`
     south_m: float
-    texture: NDArray[np.uint8]  #: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH
+    colours: Image | PaintedTexture  #: (h, w, 3) uint8 RGB albedo of exactly the rectangle; row 0 = NORTH
     texture_px_m: float  #: side of a texel along x; along y, it may differ by rounding
     #: (ny, nx) bool, nodes without a height in the source, which have the nearest height, for rendering; None: no node
     filled: NDArray[np.bool_] | None = None
@@ -80,6 +96,10 @@ class Terrain:
     #: is a survey planned and judged. None: all nodes.
     known: NDArray[np.bool_] | None = None
     stated: InputStatement | None = None  #: how the files of the floor were read; None for a generated floor
+
+    @property
+    def texture(self) -> Image:
+        return self.colours.image if isinstance(self.colours, PaintedTexture) else self.colours
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """Seafloor textures: generated from materials such as sand, rock and coral, or made from a photo."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +15,7 @@ from twin.terrains.file_header import TEXTURE_FIELD, decoded, eight_bits
 from twin.terrains.ground_cover import COVERS, paint
 from twin.terrains.noise import fractal_field, pink_noise
 from twin.terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
+from twin.terrains.terrain import PaintedTexture
 
 _PHOTOS = "a PNG, JPEG, TIFF, BMP or WebP image"
 COARSEN_TEXELS = 40_000_000  #: largest number of texels of a floor with `TextureSource.coarsen`
@@ -41,16 +43,23 @@ class TextureSource:
         return max(self.px_m, least_m) if self.coarsen else self.px_m
 
 
+def painted_texture(
+    cover: str, height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
+) -> PaintedTexture:
+    """Returns the texture of `generate_texture`, not painted yet; raises TwinError if the cover is unknown."""
+    if cover not in COVERS:
+        raise TwinError("terrain.cover", f"unknown cover {cover!r}", ", ".join(COVERS))
+    return PaintedTexture((*shape, 3), partial(generate_texture, cover, height_m, shape, texel_m, rng), rng)
+
+
 def generate_texture(
     cover: str, height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
 ) -> Image:
     """Returns a texture (rows, cols, 3) uint8 RGB, row 0 = north, of a height grid (ny, nx), row 0 = south.
 
     Height, slope and noise, in patches of up to 1 m, determine the material of a texel, one of those of `cover`, a key
-    of `COVERS`; its structure and pink noise down to single texels determine the tone. TwinError for an unknown cover.
+    of `COVERS`; its structure and pink noise down to single texels determine the tone.
     """
-    if cover not in COVERS:
-        raise TwinError("terrain.cover", f"unknown cover {cover!r}", ", ".join(COVERS))
     tone = _tone(shape, rng)
     north_up = np.ascontiguousarray(height_m[::-1])
     spacing_m = shape[1] / (height_m.shape[1] - 1) * texel_m
@@ -61,9 +70,10 @@ def generate_texture(
 
 
 def generate_wall_texture(
-    cover: str, shape: tuple[int, int], extent_m: tuple[float, float], spacing_m: float, rng: np.random.Generator
+    cover: str, shape: tuple[int, int], extent_m: tuple[float, float], spacing_m: float, floor: PaintedTexture
 ) -> Image:
     """Returns a texture (rows, cols, 3) of steep parts; rows run down from the floor's highest to its lowest point."""
+    _, rng = floor.image, floor.rng  # the random numbers after those of the floor
     tone = _tone(shape, rng)
     cols, rows = (max(2, round(extent / spacing_m) + 1) for extent in extent_m)
     patches = fractal_field((rows, cols), 1.0 / spacing_m, 0.6, rng)

@@ -7,12 +7,14 @@ to 1 at 65 deg. With the unit normal n, it is divided between them in proportion
 2007, GPU Gems 3, sec. 1.5).
 """
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from twin.core.records import Mask
-from twin.terrains.terrain import Walls
+from twin.terrains.terrain import PaintedTexture, Walls
 from twin.terrains.textures import TextureSource, generate_wall_texture, texture_from_photo
 
 #: Cosines of the slope from which on walls have a texture of their own (50 deg), and no other (65 deg).
@@ -23,13 +25,13 @@ WALL_TEXELS = 10_000_000  #: largest number of texels of the texture of walls
 
 def walls_of(
     height_m: NDArray[np.float32], spacing_m: float, source: TextureSource, cover: str, texel_m: float,
-    rng: np.random.Generator, draped: Mask | None = None,
+    floor: PaintedTexture, draped: Mask | None = None,
 ) -> Walls | None:  # fmt: skip
     """Returns the walls of a floor of heights (ny, nx), row 0 = south; None if it has none, or no part is steep.
 
-    `cover` is a key of `ground_cover.COVERS`, for a floor without photo, `texel_m` the side of the texels of the floor
-    and, within WALL_TEXELS, of the walls. An orthophoto covers the texels `draped` (rows, cols), row 0 = north, where
-    there are no walls.
+    Without photo, they are painted with `cover`, a key of `ground_cover.COVERS`, with the random numbers after those of
+    the texture of the `floor`. `texel_m` is the side of the texels of the floor and, within WALL_TEXELS, of the walls.
+    An orthophoto covers the texels `draped` (rows, cols), row 0 = north, where there are no walls.
     """
     found = wall_weights(height_m, spacing_m, draped) if source.walls else None
     if found is None:
@@ -39,10 +41,10 @@ def walls_of(
     texel_m = max(texel_m, float(np.sqrt(length_m * rise_m / WALL_TEXELS)))
     shape = max(2, round(rise_m / texel_m)), max(2, round(length_m / texel_m))
     if source.photo_file is not None:
-        texture = texture_from_photo(source, shape, (length_m, rise_m))
+        paint = partial(texture_from_photo, source, shape, (length_m, rise_m))
     else:
-        texture = generate_wall_texture(cover, shape, (length_m, rise_m), spacing_m, rng)
-    return Walls(*found, texture, length_m, low_m, high_m)
+        paint = partial(generate_wall_texture, cover, shape, (length_m, rise_m), spacing_m, floor)
+    return Walls(*found, PaintedTexture((*shape, 3), paint, floor.rng), length_m, low_m, high_m)
 
 
 def wall_weights(

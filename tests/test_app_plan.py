@@ -17,7 +17,8 @@ from twin.planning import summary as plan_summary
 from twin.planning.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
-from twin.surrogate.matchability import EVEN_TEXTURE, WindowTexture
+from twin.surrogate.matchability import EVEN_TEXTURE, WindowTexture, _generated
+from twin.terrains.ground_cover import paint
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import prepare
 
@@ -135,6 +136,17 @@ def test_the_summary_counts_the_objects_and_names_a_surrogate_that_leaves_them_o
         assert plan_summary.as_json(given, "")["objects"] == 1
         assert dict(plan_summary.rows(given))["objects"].startswith("1, not included" if left_out else "1, included")
         assert any(w.endswith("both leave out [[objects]]") for w in given.warnings) == left_out
+
+
+@pytest.mark.parametrize("fidelity", ["rendered", "surrogate"])
+def test_a_plan_does_not_paint_its_floor(fidelity, monkeypatch):
+    """The matching precision needs the texture of a part of it, as large as an image."""
+    painted = []
+    monkeypatch.setattr("twin.terrains.textures.paint", lambda *given: painted.append(given[0].size) or paint(*given))
+    _generated.cache_clear()
+    given = summary_of(f"imaging.fidelity={fidelity}", "terrain.texture_px_m=0.02")
+    assert given.cost.memory_mb > 0 and given.mission.terrain.size_m == (9.0, 7.0)
+    assert len(painted) == 1 and painted[0] < 0.5 * 450 * 350
 
 
 def test_the_table_has_four_statistics_in_ascending_order(summary):

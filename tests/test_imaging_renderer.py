@@ -121,7 +121,7 @@ def test_rendered_points_are_on_the_terrain(terrain: Terrain, pose: np.ndarray) 
 def test_albedo_agrees_with_the_image_of_mujoco(terrain: Terrain, height_m: float) -> None:
     """At up to 5 texels per pixel. Powers of two, for which OpenGL's levels are means of 2 x 2 texels, too."""
     texture = np.ascontiguousarray(terrain.texture[:1024, :2048])
-    terrain = replace(terrain, texture=texture, texture_px_m=7 / 2048)
+    terrain = replace(terrain, colours=texture, texture_px_m=7 / 2048)
     pose = geometry.pose(
         geometry.rotation_from_rpy(0.15, -0.1, 0.5) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.2, height_m])
     )

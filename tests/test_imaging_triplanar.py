@@ -130,9 +130,11 @@ def test_two_views_of_a_wall_show_the_same_albedo() -> None:
     """The texture is blurred, so that only the different filters of the views remain: on walls as on level ground."""
     terrain = floor(bumps)
     assert terrain.walls is not None
+    of_walls = terrain.walls.texture
+    blurred = cv2.GaussianBlur(of_walls.image, (0, 0), 4)
     smooth = replace(
-        terrain, texture=cv2.GaussianBlur(terrain.texture, (0, 0), 4),
-        walls=terrain.walls._replace(texture=cv2.GaussianBlur(terrain.walls.texture, (0, 0), 4)),
+        terrain, colours=cv2.GaussianBlur(terrain.texture, (0, 0), 4),
+        walls=terrain.walls._replace(texture=replace(of_walls, paint=lambda: blurred)),
     )  # fmt: skip
     first = looking(np.array([0.2, 0.1, -1.0]), np.zeros(3), 2.2)
     second = first @ geometry.pose(geometry.rotation_from_rpy(0.1, -0.15, 0.6), np.array([0.3, -0.1, 0.1]))
@@ -179,8 +181,10 @@ def test_a_uniform_colour_of_floor_and_walls_is_exact() -> None:
     terrain = floor(bumps)
     assert terrain.walls is not None
     colour = np.array([200, 17, 93], np.uint8)
-    walls = terrain.walls._replace(texture=np.full_like(terrain.walls.texture, colour))
-    painted = replace(terrain, texture=np.full_like(terrain.texture, colour), walls=walls)
+    of_walls = terrain.walls.texture
+    plain = replace(of_walls, paint=lambda: np.full(of_walls.shape, colour, np.uint8))
+    walls = terrain.walls._replace(texture=plain)
+    painted = replace(terrain, colours=np.full_like(terrain.texture, colour), walls=walls)
     ((albedo, depth),) = render(painted, looking(np.array([0.5, 0.2, -1.0]), np.zeros(3), 2.0))
     assert np.all(albedo[np.isfinite(depth)] == colour)
     grid = MapGrid(-1.0, 1.0, 0.02, 100, 100)

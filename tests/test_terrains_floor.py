@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from twin import terrains
 from twin.errors import TwinError
 from twin.terrains import Terrain, TextureSource
 from twin.terrains.ground_cover import COVERS, GRAINS, Cover, paint
-from twin.terrains.textures import COARSEN_TEXELS
+from twin.terrains.textures import COARSEN_TEXELS, generate_texture
 
 KINDS = ("ripples", "fractal", "reef", "cliffs")
 
@@ -51,6 +54,30 @@ def test_equal_seeds_give_equal_heights_and_textures(kind: str) -> None:
     one, same, other = floor(kind, 1), floor(kind, 1), floor(kind, 2)
     assert np.array_equal(one.height_m, same.height_m) and np.array_equal(one.texture, same.texture)
     assert not np.array_equal(one.texture, other.texture)
+
+
+def test_a_texture_painted_later_is_that_painted_at_once_also_before_and_after_the_walls_and_in_a_copy() -> None:
+    """The walls take their random numbers from the same generator, after the floor."""
+    first, second = (
+        terrains.generate("reef", (3.0, 2.0), 0.9, 0.0, 0.05, TextureSource(0.01, walls=True), 1) for _ in range(2)
+    )
+    copy = pickle.loads(pickle.dumps(first))
+    at_once = generate_texture("reef", first.height_m, (200, 300), 0.01, np.random.default_rng(1).spawn(2)[1])
+    assert first.walls is not None and second.walls is not None
+    of_walls = first.walls.texture.image  # before the floor
+    assert np.array_equal(first.texture, at_once) and np.array_equal(second.texture, at_once)
+    assert np.array_equal(second.walls.texture.image, of_walls)
+    assert np.array_equal(copy.texture, at_once) and np.array_equal(copy.walls.texture.image, of_walls)
+    assert of_walls.shape == first.walls.texture.shape and at_once.shape == replace(first).colours.shape
+
+
+def test_a_texture_is_painted_when_it_is_asked_for_and_once_for_all_copies_of_a_floor(monkeypatch) -> None:
+    painted = []
+    monkeypatch.setattr("twin.terrains.textures.paint", lambda *given: painted.append(1) or paint(*given))
+    terrain = floor("reef")
+    raised = replace(terrain, height_m=terrain.height_m + 1)
+    assert not painted
+    assert raised.texture is terrain.texture and len(painted) == 1
 
 
 def test_a_reef_is_steep_but_not_beyond_sixty_degrees() -> None:

@@ -63,12 +63,13 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
 
 
 def _floor_mb(mission: Mission) -> float:
-    terrain, walls = mission.terrain, mission.terrain.walls
-    floor_mb = _NODE_MB * terrain.height_m.size + _TEXEL_MB * (terrain.texture.size / 3)
+    terrain, walls, (rows, cols, _) = mission.terrain, mission.terrain.walls, mission.terrain.colours.shape
+    floor_mb = _NODE_MB * terrain.height_m.size + _TEXEL_MB * (rows * cols)
     if mission.mesh_floor is not None:
         tiles, textures = mission.mesh_floor.tiles
         n_faces = sum(len(tile.placed.model.levels[0].mesh.faces) for tile in tiles)
         floor_mb += _FACE_MB * n_faces + _MESH_TEXEL_MB * len(textures.texels) * 3 / 4
     if walls is not None:
-        floor_mb += _WALL_CELL_MB * len(walls.weights) + _WALL_TEXEL_MB * walls.texture.size / 3
+        rows, cols, _ = walls.texture.shape
+        floor_mb += _WALL_CELL_MB * len(walls.weights) + _WALL_TEXEL_MB * (rows * cols)
     return floor_mb

@@ -44,9 +44,8 @@ def wall_surface(terrain: Terrain) -> WallSurface:
     if walls is None:
         return NO_WALLS
     length = np.float32(walls.texture.shape[1])
-    return WallSurface(
-        walls.number, walls.weights, levels_of(walls.texture), length / np.float32(walls.length_m), length
-    )
+    levels = levels_of(walls.texture.image)
+    return WallSurface(walls.number, walls.weights, levels, length / np.float32(walls.length_m), length)
 
 
 def paint_walls_from_above(
