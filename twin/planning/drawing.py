@@ -31,7 +31,6 @@ def draw(summary: PlanSummary, file: Path) -> None:
     with png_figure(file, 14, 6.5) as figure:
         plan, overlap = figure.subplots(1, 2, sharex=True, sharey=True)
         _draw_floor(plan, summary)
-        _draw_holes(plan, mission)
         _draw_path(plan, summary)
         add_coordinates(plan, mission.chart.georeference)
         _draw_overlap(overlap, summary)
@@ -68,12 +67,13 @@ def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
 def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
     mission = summary.mission
     t, top = mission.chart, summary.floor.surface
+    extent = t.west_m, t.east_m, t.south_m, t.north_m
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
-    hole = t.in_hole(*np.meshgrid(x, y))
-    height, top_m = (surface.height_at(*np.meshgrid(x, y)) for surface in (t, top))
-    steps = (x[1] - x[0], y[0] - y[1])
-    shade = LightSource(315, 45).hillshade(top_m, vert_exag=1, dx=steps[0], dy=steps[1])
-    axes.imshow(np.where(hole, np.nan, shade), cmap="gray", vmin=-0.5, vmax=1.1, extent=_extent(mission))
+    points = np.meshgrid(x, y)
+    hole, height = t.in_hole(*points), t.height_at(*points)
+    top_m = height if top is t else top.height_at(*points)
+    shade = LightSource(315, 45).hillshade(top_m, dx=x[1] - x[0], dy=y[0] - y[1])
+    axes.imshow(np.where(hole, np.nan, shade), cmap="gray", vmin=-0.5, vmax=1.1, extent=extent)
     height, top_m = (np.where(hole, np.nan, heights) for heights in (height, top_m))
     if np.nanmax(height, initial=-np.inf) > np.nanmin(height, initial=np.inf):
         contours = axes.contour(x, y, height, levels=6, cmap="viridis", linewidths=0.8)
@@ -81,26 +81,14 @@ def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
     if top is not t:
         axes.contour(x, y, top_m - height, levels=[_LEAST_DRAWN_M], colors=[COLOURS["truth"]], linewidths=0.9)
         axes.plot([], [], color=COLOURS["truth"], linewidth=0.9, label=f"{len(mission.objects)} objects")
-
-
-def _draw_holes(axes: Axes, mission: Mission) -> None:
-    t = mission.chart
-    x, y = np.meshgrid(
-        np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
-    )
     masks = {
-        "hole": (t.in_hole(x, y), f"no height ({100 * t.unknown_share:.3g} % of the floor)"),
-        "filled": (t.in_filled(x, y), "small holes, filled"),
+        "hole": (hole, f"no height ({100 * t.unknown_share:.3g} % of the floor)"),
+        "filled": (t.in_filled(*points), "small holes, filled"),
     }
     for colour, (mask, label) in masks.items():
         if mask.any():
-            axes.imshow(np.where(mask, 1.0, np.nan), cmap=ListedColormap([COLOURS[colour]]), extent=_extent(mission))
+            axes.imshow(np.where(mask, 1.0, np.nan), cmap=ListedColormap([COLOURS[colour]]), extent=extent)
             axes.plot([], [], "s", color=COLOURS[colour], label=label)
-
-
-def _extent(mission: Mission) -> tuple[float, float, float, float]:
-    t = mission.chart
-    return t.west_m, t.east_m, t.south_m, t.north_m
 
 
 def _draw_path(axes: Axes, summary: PlanSummary) -> None:

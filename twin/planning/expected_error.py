@@ -34,9 +34,8 @@ class ExpectedError(NamedTuple):
         share = percent / 100
         if share >= 1 - holes or len(self.sigma_m) == 0:
             return None
-        sigma = self.sigma_m
-        below = lambda x: (1 - holes) * float(np.mean(2 * ndtr(x / sigma) - 1)) - share  # noqa: E731
-        high = float(sigma.max())
+        below = lambda x: (1 - holes) * float(np.mean(2 * ndtr(x / self.sigma_m) - 1)) - share  # noqa: E731
+        high = float(self.sigma_m.max())
         while below(high) < 0:
             high *= 2
         return float(root_scalar(below, bracket=(0.0, high), method="brentq", xtol=1e-9).root)

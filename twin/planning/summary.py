@@ -98,11 +98,8 @@ def summarise(mission: Mission) -> PlanSummary:
     require = judge_requirements({n: v for n, v in mission.scenario.require.items() if n in known}, predicted)
     holes = (note.removesuffix(".") for note in mission.hole_notes)
     scenario, latency = mission.scenario, None
-    if (
-        n_late := frames_of_latency(scenario)
-        if scenario.vehicle.dynamics == "rigid" and not scenario.control.plugin
-        else 0
-    ):
+    built_in = scenario.vehicle.dynamics == "rigid" and not scenario.control.plugin
+    if built_in and (n_late := frames_of_latency(scenario)):
         latency = Latency(n_late / mission.rig.frame_rate_hz, largest_latency_s(mission))
     late = [f"the latency is too long for a stable flight: {latency.text}"] if latency and latency.unstable else []
     warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error), *late)

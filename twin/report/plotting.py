@@ -38,23 +38,25 @@ def png_figure(file: Path, width_in: float, height_in: float, grid: bool = True)
         figure = Figure(figsize=(width_in, height_in))
         yield figure
         file.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(file, format="png")
+        file.write_bytes(png_bytes(_pixels(figure)))
 
 
 def to_data_uri(figure: Figure, photo: bool = False) -> str:
-    """Returns a figure without its white margins as data URI, PNG or, of a photo, JPEG.
-
-    matplotlib's own `tight` would draw it twice.
-    """
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    """Returns a figure without its white margins as data URI, PNG or, of a photo, JPEG."""
+    pixels = _pixels(figure)
     inked = (pixels != 255).any(axis=2)
     rows, cols = (np.flatnonzero(inked.any(axis=axis)) for axis in (1, 0))
     pad = round(PAD_IN * figure.dpi)
     kept = tuple(slice(max(0, at[0] - pad), at[-1] + pad + 1) for at in (rows, cols)) if len(rows) else ()
     data = jpeg_bytes(pixels[kept], max(pixels.shape)) if photo else png_bytes(pixels[kept])
     return f"data:image/{'jpeg' if photo else 'png'};base64," + base64.b64encode(data).decode()
+
+
+def _pixels(figure: Figure) -> np.ndarray:
+    """Returns the pixels (rows, cols, 3) of a figure, which `savefig` of matplotlib would draw twice."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
 def one_panel(height_in: float) -> tuple[Figure, Axes]:
