@@ -168,7 +168,7 @@ MUTANTS = [
         ("twin/tuning/verification.py", "self.probability.low >= self.required", "self.probability.value >= self.required", "study_verification"),
         ("twin/tuning/correction.py", "math.exp(-0.5 * (plan_distance", "math.exp(0.5 * (plan_distance", "study_rendered_check study_tuning study_verification"),
         ("twin/planning/cost.py", "n_frames * frame + n_keyframes *", "n_frames * frame - n_keyframes *", "app_plan"),
-        ("twin/planning/expected_error.py", "float(np.mean(2 * ndtr(x / sigma) - 1)) - share", "float(np.mean(ndtr(x / sigma))) - share", "app_plan"),
+        ("twin/planning/expected_error.py", "float(np.mean(2 * ndtr(x / self.sigma_m) - 1)) - share", "float(np.mean(ndtr(x / self.sigma_m))) - share", "app_plan"),
         ("twin/reproduce/tank_sizes.py", "share = np.sqrt(3) / 2 if item.shape == \"dome\"", "share = 0.5 if item.shape == \"dome\"", "reproduce_tank"),
         # self-calibration, rigs, interrupts
         ("twin/estimate/vision/observation_equations.py", "-x * points[i, 1] / 2, 1 + x * x", "x * points[i, 1] / 2, 1 + x * x", "estimate_self_calibration"),

@@ -1,8 +1,10 @@
-"""Formats of `twin export`: the table of all formats, and the checks of a request."""
+"""Formats of `twin export`, those of `formats.toml` and of the planned path, and the checks of a request."""
 
 import difflib
+import tomllib
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +16,7 @@ class ExportFormat(NamedTuple):
     """A format of `twin export`."""
 
     description: str  #: one line for the list of formats
-    needs: tuple[str, ...]  #: contents without which the format cannot be written (`_NEEDS`)
+    needs: Sequence[str]  #: contents without which the format cannot be written (`_NEEDS`)
     writer: str  #: module and function, imported when they are called, because writers need large packages
 
     def write(self, contents: RunContents, folder: Path) -> list[Path]:
@@ -23,32 +25,6 @@ class ExportFormat(NamedTuple):
         return getattr(import_module(f"twin.{module}"), function)(contents, folder)
 
 
-#: Name, needs, writer and description of each format, in the order in which `twin export --list` shows them.
-_TABLE = (
-    ("euroc", "images", "datasets.euroc:export",
-     "EuRoC/ASL folder: stereo images, calibration, truth, sensor readings"),
-    ("kitti", "pairs", "datasets.kitti:export",
-     "KITTI odometry sequence: stereo pairs, calib.txt, times.txt, true poses"),
-    ("tum", "", "datasets.tum:export", "TUM: trajectories of the left camera, lists of images"),
-    ("colmap", "pairs poses", "datasets.colmap:export",
-     "COLMAP text model: stereo rig, poses, 3D points of the map with tracks"),
-    ("nerfstudio", "images poses", "exports.nerfstudio:export", "nerfstudio: transforms.json and images"),
-    ("calibration", "", "datasets.calibration_files:export",
-     "camera calibration in OpenCV, Kalibr and COLMAP form, true and believed"),
-    ("ifdo", "images poses", "exports.ifdo:export", "iFDO v2.1 metadata of the images (JSON)"),
-    ("metashape", "images poses", "exports.metashape:export",
-     "Metashape reference CSV: position and attitude of each image"),
-    ("truth", "images world", "exports.truth_images:export",
-     "exact truth of each left image: depth, flow, normals, albedo, clear water, light, veil, labels"),
-    ("mcap", "images", "datasets.ros2.bag_writer:export",
-     "ROS 2 bag in MCAP: images, camera_info, tf, odometry, attitude, pressure, DVL"),
-    ("cog", "map", "exports.cloud_optimised:export", "cloud-optimised GeoTIFF: elevation, sigma, error, orthomosaic"),
-    ("ply", "map", "exports.point_cloud:export_ply", "point cloud of the map with colour and sigma, PLY"),
-    ("laz", "map", "exports.point_cloud:export_laz", "point cloud of the map with colour and sigma, LAZ"),
-    ("glb", "map", "exports.textured_mesh:export_glb", "mesh of the map with the orthomosaic as texture, binary glTF"),
-    ("obj", "map", "exports.textured_mesh:export_obj",
-     "mesh of the map with the orthomosaic as texture, Wavefront OBJ"),
-)  # fmt: skip
 #: Formats of the planned path of a scenario: description, suffix, and writer in `path_files`.
 PATH_FORMATS = {
     "qgc": ("planned path: mission of QGroundControl for ArduSub", ".plan", "write_qgc"),
@@ -56,7 +32,8 @@ PATH_FORMATS = {
     "gpx": ("planned path: GPX 1.1, a route", ".gpx", "write_gpx"),
     "csv": ("planned path: waypoints in the scene, in its CRS and on WGS 84", ".csv", "write_csv"),
 }
-FORMATS = {name: ExportFormat(text, tuple(needs.split()), writer) for name, needs, writer, text in _TABLE}
+_TABLE = tomllib.loads(files("twin.exports").joinpath("formats.toml").read_text(encoding="utf-8"))
+FORMATS = {name: ExportFormat(**fields) for name, fields in _TABLE.items()}
 
 
 #: What a format may need: whether a run has it, the problem of one that has not, and a run that has it.

@@ -138,7 +138,7 @@ def thinned(pairs: ImagePairs, most: int) -> ImagePairs:
 def overlap_metrics(
     result: SurveyResult, truth: Truth, rig: StereoRig, grid: MapGrid | None, planned: Mapping[str, Any]
 ) -> dict[str, float | None]:
-    """Returns `overlap.*` of metrics.json, from `MOST_PAIRS` pairs of each direction.
+    """Returns `overlap.*` of metrics.json, from at most 500 pairs of images in each direction.
 
     Args:
         grid: cells of `truth.height_m`; None: the floor is taken to be level, at the mean height.
