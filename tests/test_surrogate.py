@@ -242,9 +242,7 @@ def test_frames_are_tracked_with_the_yaw_that_was_known_when_their_points_were_m
 
 
 def lamp_share_of(m, depth_m=2.0):
-    images = FloorImages(m.scenario, m.illumination)
-    (albedo,) = floor_albedos(images, m.terrain, np.array([2.0]))
-    return lamp_share(images, images.components(albedo, depth_m).floor_lx, depth_m)
+    return lamp_share(FloorImages(m.scenario, m.illumination), depth_m)
 
 
 def test_the_lamp_share_decreases_with_sunlight():
@@ -440,8 +438,8 @@ def light_of(m, depth_m):
     """Returns the arguments of `position_dependence` for a level floor at a depth."""
     images = FloorImages(m.scenario, m.illumination)
     (albedo,) = floor_albedos(images, m.terrain, np.array([2.0]))
-    noise = images.matched(albedo, depth_m, np.random.default_rng(0)).noise
-    return images.contrast(images.components(albedo, depth_m)), noise
+    matched = images.matched(albedo, depth_m, np.random.default_rng(0))
+    return images.contrast(albedo, depth_m, matched.even), matched.noise
 
 
 def test_lamps_make_the_centre_of_the_image_more_precise_than_its_sides_and_daylight_does_not():

@@ -127,8 +127,13 @@ class ImageFormation:
             snow = before.copy()
             self.add_snow(snow, view)
             snow -= before
-        floor_lx = self._optics.floor_lx(view.depth, view.camera, scene)
-        return RadianceComponents(floor_lx, direct, forward, backscatter, snow, self.radiance(view))
+        return RadianceComponents(self.floor_lx(view), direct, forward, backscatter, snow, self.radiance(view))
+
+    def floor_lx(self, view: RenderedView) -> Radiance:
+        return self._optics.floor_lx(view.depth, view.camera, self._scene(view))
+
+    def direct(self, view: RenderedView) -> Radiance:
+        return self._optics.direct(*view[:3], self._scene(view))
 
     def _scene(self, view: RenderedView) -> SceneView:
         _, depth, camera, pose, objects = view

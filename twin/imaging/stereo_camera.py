@@ -158,7 +158,8 @@ class StereoCamera:
         motion = sensor.motion(self.twist_of_camera(view.camera, twist_body), setting, len(view.depth))
         if motion is not None:
             motion = motion._replace(rolls_later=self._cameras.sampling is not None)
-        light = light_after_lens(self._image_formation, self.psf, view, self._focal_px, motion)
+        light = self._image_formation.radiance_without_snow(view)
+        light = light_after_lens(self._image_formation, self.psf, view, light, self._focal_px, motion)
         return self._cameras.sample(light, view.depth, view.camera, motion=motion)
 
 
@@ -166,16 +167,16 @@ def light_after_lens(
     formation: ImageFormation,
     psf: LensPsf,
     view: RenderedView,
+    light: Radiance,
     focal_px: float,
     motion: ExposureMotion | None,
     snow: bool = True,
-    before: Radiance | None = None,
 ) -> Radiance:
-    """Returns the light (H, W, 3) of a view behind the lens of a moving camera, given that `before` the lens if known.
+    """Returns the light (H, W, 3) of a view, given without snow (may be overwritten), behind a moving camera's lens.
 
     Marine snow, which has other depths and velocities, is drawn with its own blur after lens and motion.
     """
-    light = psf.out_of_focus(formation.radiance_without_snow(view) if before is None else before, view.depth)
+    light = psf.out_of_focus(light, view.depth)
     if motion is not None:
         light = integrate(light, view.depth, focal_px, motion)
     if snow:

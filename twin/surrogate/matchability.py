@@ -29,7 +29,7 @@ from twin.estimate.vision.stereo import BINNINGS
 from twin.imaging.camera.lens_psf import LensPsf
 from twin.imaging.camera.photo_sensor import Sensor, sensor_of
 from twin.imaging.camera.sensor import ExposureSetting
-from twin.imaging.image_formation import ImageFormation, RadianceComponents, RenderedView, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
 from twin.imaging.stereo_camera import light_after_lens
@@ -73,10 +73,11 @@ EVEN_TEXTURE = WindowTexture(1.0, 0.0)
 
 
 class MatchedImages(NamedTuple):
-    """Images (H, W, 3) [grey levels]: the part that texture causes, and the difference of two images by their noise."""
+    """Images (H, W, 3) of a floor with texture, and its light with the mean colour instead."""
 
-    signal: NDArray[np.float32]
-    noise: NDArray[np.float32]
+    signal: NDArray[np.float32]  #: part that the texture causes [grey levels]
+    noise: NDArray[np.float32]  #: difference of two images by their noise [grey levels]
+    even: Radiance  #: light of the floor without texture and snow [cd/m2]
 
     def bound_px(self, patch_px: int, binning: int) -> float:
         """Returns the Cramér-Rao bound of a patch's position [px of the images binned to `binning`]."""
@@ -100,49 +101,50 @@ class FloorImages:
 
     def matched(self, albedo: Image, depth_m: float, rng: np.random.Generator) -> MatchedImages:
         view, even = self._level_floor(albedo, depth_m), self._level_floor(_mean_colour(albedo), depth_m)
-        sensor, setting, before = self._metered(view)
-        light = self._recorded(view, sensor, setting, before=before)
-        signal = sensor.levels(light, setting) - sensor.levels(self._recorded(even, sensor, setting), setting)
+        light, light_of_even = (self._formation.radiance_without_snow(one) for one in (view, even))
+        sensor, setting, _ = self._metered(view, light)
+        light, expected = (self._recorded(*one, sensor, setting) for one in ((view, light), (even, light_of_even)))
+        signal = sensor.levels(light, setting) - sensor.levels(expected, setting)
         first, second = (sensor.image(light, setting, rng).astype(np.float32) for _ in range(2))
-        return MatchedImages(signal, first - second)
+        return MatchedImages(signal, first - second, light_of_even)
 
-    def components(self, albedo: Image, depth_m: float) -> RadianceComponents:
-        """Returns the components of the light of a floor that has the mean colour of an albedo image."""
-        return self._formation.components(self._level_floor(_mean_colour(albedo), depth_m))
+    def contrast(self, albedo: Image, depth_m: float, light: Radiance) -> NDArray[np.float32]:
+        """Returns the grey levels (H, W, 3) that a small texture of unit contrast adds to `MatchedImages.even`."""
+        view = self._level_floor(_mean_colour(albedo), depth_m)
+        sensor, setting, light = self._metered(view, light)
+        brighter = np.asarray(light + np.float32(_SMALL_CONTRAST) * self._formation.direct(view), np.float32)
+        return (sensor.levels(brighter, setting) - sensor.levels(light, setting)) / np.float32(_SMALL_CONTRAST)
 
-    def contrast(self, light: RadianceComponents) -> NDArray[np.float32]:
-        """Returns the grey levels (H, W, 3) that a small texture of unit contrast adds to the image of a floor."""
-        sensor = sensor_of(self.scenario, self.rig)
-        setting = sensor.meter(light.total)
-        brighter = np.asarray(light.total + np.float32(_SMALL_CONTRAST) * light.direct, np.float32)
-        return (sensor.levels(brighter, setting) - sensor.levels(light.total, setting)) / np.float32(_SMALL_CONTRAST)
+    def floor_lx(self, depth_m: float) -> Radiance:
+        """Returns the illuminance (H, W, 3) of the floor at a depth [lx]."""
+        black = np.zeros((self.rig.height_px, self.rig.width_px, 3), np.uint8)
+        return self._formation.floor_lx(self._level_floor(black, depth_m))
 
     def snow_levels(self, albedo: Image, depth_m: float) -> list[list[NDArray[np.float32]]]:
         """Returns noise-free images (H, W, 3) of a floor without snow, and the same with different particles."""
         view = self._level_floor(albedo, depth_m)
         views = [view._replace(pose=shifted) for shifted in snow_poses(view.pose)]
-        sensor, setting, _ = self._metered(view)
+        pairs = [(one, self._formation.radiance_without_snow(one)) for one in views]
+        sensor, setting, _ = self._metered(*pairs[0])
         return [
-            [sensor.levels(self._recorded(one, sensor, setting, snow), setting) for one in views]
+            [sensor.levels(self._recorded(*one, sensor, setting, snow), setting) for one in pairs]
             for snow in (False, True)
         ]
 
-    def _metered(self, view: RenderedView) -> tuple[Sensor, ExposureSetting, Radiance]:
-        """Returns the sensor, its exposure of a view with snow, and the light (H, W, 3) of the view without snow."""
-        sensor, light = sensor_of(self.scenario, self.rig), self._formation.radiance_without_snow(view)
-        with_snow = light.copy()
-        self._formation.add_snow(with_snow, view)
-        return sensor, sensor.meter(with_snow), light
+    def _metered(self, view: RenderedView, light: Radiance) -> tuple[Sensor, ExposureSetting, Radiance]:
+        """Returns a sensor, its exposure, and the light of a view, given without snow (H, W, 3), with snow."""
+        light, sensor = light.copy(), sensor_of(self.scenario, self.rig)
+        self._formation.add_snow(light, view)
+        return sensor, sensor.meter(light), light
 
     def _recorded(
-        self, view: RenderedView, sensor: Sensor, setting: ExposureSetting, snow: bool = False,
-        before: Radiance | None = None,
-    ) -> Radiance:  # fmt: skip
-        """Returns the light (H, W, 3) on the sensor of the camera, which moves with the planned speed."""
+        self, view: RenderedView, light: Radiance, sensor: Sensor, setting: ExposureSetting, snow: bool = False
+    ) -> Radiance:
+        """Returns the light (H, W, 3) of a view, given without snow, on the sensor, which moves with planned speed."""
         motion = sensor.motion(self._twist, setting, len(view.depth))
         if motion is not None:
             motion = motion._replace(rolls_later=True)  # the estimators correct the readout
-        return light_after_lens(self._formation, self._psf, view, self.rig.focal_px, motion, snow, before)
+        return light_after_lens(self._formation, self._psf, view, light.copy(), self.rig.focal_px, motion, snow)
 
     def _level_floor(self, albedo: Image, depth_m: float) -> RenderedView:
         world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, self.scenario.plan.altitude_m]))
@@ -181,12 +183,12 @@ class Matchability:
         albedos = floor_albedos(images, terrain, self.depths_m)
         found = [images.matched(albedo, z, rng) for albedo, z in zip(albedos, self.depths_m, strict=True)]
         self._set_image_scale(images, albedos, found)
-        light = images.components(albedos[_MIDDLE], self.medium_depth_m)
-        self.dependence = position_dependence(images.contrast(light), found[_MIDDLE].noise)
+        contrast = images.contrast(albedos[_MIDDLE], self.medium_depth_m, found[_MIDDLE].even)
+        self.dependence = position_dependence(contrast, found[_MIDDLE].noise)
         signal = matching.gray(found[_MIDDLE].signal, self.binning)
         self.texture = window_texture(signal, self.dependence.gradients)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
-        self.lamp_share = lamp_share(images, light.floor_lx, self.medium_depth_m)
+        self.lamp_share = lamp_share(images, self.medium_depth_m)
 
     @property
     def medium_bound_px(self) -> float:
@@ -241,11 +243,12 @@ def in_snow(
     return float(np.sqrt(variance_px2)), share
 
 
-def lamp_share(images: FloorImages, floor_lx: Radiance, depth_m: float) -> float:
-    """Returns the lamps' fraction of the light reflected by a level floor of illuminance `floor_lx` (H, W, 3) [lx]."""
+def lamp_share(images: FloorImages, depth_m: float) -> float:
+    """Returns the lamps' fraction of the light that a level floor at a depth reflects."""
     scenario = images.scenario
     if not scenario.lamps or scenario.sun.illuminance_lx == 0:
         return float(bool(scenario.lamps))
+    floor_lx = images.floor_lx(depth_m)
     depth = np.full(floor_lx.shape[:2], depth_m, np.float32)
     unlit_lx = Optics(images.rig, images.illumination, ()).floor_lx(depth, 0)
     back = np.exp(-images.illumination.water.camera_loss_per_m * depth_m)

@@ -152,10 +152,17 @@ class Optics:
         light, backscatter = self._floor_and_backscatter(albedo, depth, camera, scene)
         if self._forward is None:
             return LightParts(light, None, backscatter)
-        range_m = range_of(depth, self._rig)
-        unscattered = np.exp(-self._medium.scattering_per_m * range_m[..., None])
-        forward = self._forward.spread(light, range_m, self.around(albedo, depth, camera, scene))
-        return LightParts((light * unscattered).astype(np.float32), forward, backscatter)
+        forward = self._forward.spread(light, range_of(depth, self._rig), self.around(albedo, depth, camera, scene))
+        return LightParts((light * self._unscattered(depth)).astype(np.float32), forward, backscatter)
+
+    def direct(self, albedo: Image, depth: Depth, camera: int, scene: SceneView = BARE_FLOOR) -> Radiance:
+        """Returns `LightParts.direct` of `parts`, with the same arguments."""
+        light, _ = self._floor_and_backscatter(albedo, depth, camera, scene)
+        return light if self._forward is None else (light * self._unscattered(depth)).astype(np.float32)
+
+    def _unscattered(self, depth: Depth) -> Array:
+        """Returns the share (H, W, 3) of the floor's light that is not scattered on its way to the camera."""
+        return np.exp(-self._medium.scattering_per_m * range_of(depth, self._rig)[..., None])
 
     def floor_lx(self, depth: Depth, camera: int, scene: SceneView = BARE_FLOOR) -> Radiance:
         """Returns the illuminance of the floor (H, W, 3) [lx]; the arguments are those of `radiance`.
@@ -183,8 +190,7 @@ class Optics:
             mean = np.mean(albedo, axis=(0, 1)).astype(np.float32)
             return forward.spread(floor_light, range_m, (around * mean, place.copy()))
 
-        unscattered = np.exp(-self._medium.scattering_per_m * range_m[..., None])
-        return WhiteFloor(light, backscatter, unscattered, forward.core(range_m), spread)
+        return WhiteFloor(light, backscatter, self._unscattered(depth), forward.core(range_m), spread)
 
     def veil(self, camera: int, surface: WaterSurface | None, pixel: Array, range_m: Array) -> Array:
         """Returns the backscatter (n, 3) between a camera and ranges (n,) [m] at pixels (n, 2), column and row [cd/m2].

@@ -19,6 +19,7 @@ from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.special import j1
 
@@ -43,9 +44,8 @@ LAMP_SIGMA_RAD = 2.0 ** np.arange(-12.0, 0.5)
 @lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
 def lamp_mixture(water: BandWater, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
     """Returns a lamp's kernel, relative to exp(-a d): weights (n, m) of Gaussians of `LAMP_SIGMA_RAD`."""
-    rings = _rings(np.pi)
-    once = np.array([_lamp_rings(water, d, receiver) for d in distances_m])
-    return _mixtures(once, rings, water.scattering_per_m * np.array(distances_m), LAMP_SIGMA_RAD)
+    once = _lamp_rings(water, distances_m)[0 if receiver == "floor" else 1]
+    return _mixtures(once, _rings(np.pi), water.scattering_per_m * np.array(distances_m), LAMP_SIGMA_RAD)
 
 
 @lru_cache(maxsize=64)
@@ -89,24 +89,27 @@ def _phase_on_rings(scatterer: Scatterer, most: float) -> Array:
 
 
 @cache
-def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
-    """Returns two tables (ANGLES, ANGLES) over the scattering angle t and the angle beta at the lamp."""
-    # response of the receiver times the part of the cell of beta below t, and path / d - 1
+def _lamp_geometry() -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+    """Returns the n cells of angle beta at the lamp and scattering angle t above it, sorted by beta, then t."""
+    # number (n,) of the ring of t, first cell (ANGLES,) of each beta, response of floor and particle times the part of
+    # the cell of beta below t (2, n), and path / d - 1 (n,)
     edges = _rings(np.pi)
-    t = _middle(edges)[:, None]
-    inside = np.clip(t - edges[:-1], 0.0, np.diff(edges))  # the part of each cell of beta that is below t
-    beta = np.minimum(edges[:-1] + inside / 2, t)
-    alpha = t - beta
-    excess = (np.sin(beta) + np.sin(alpha)) / np.maximum(np.sin(t), 1e-12) - 1
-    response = np.maximum(np.cos(alpha), 0.0) if receiver == "floor" else np.ones_like(alpha)
-    return response * inside, np.maximum(excess, 0.0)
+    t, beta = _middle(edges), edges[:-1, None]
+    inside = np.clip(t - beta, 0.0, np.diff(edges)[:, None])  # the part of each cell of beta that is below t
+    beta = np.minimum(beta + inside / 2, t)
+    excess = (np.sin(beta) + np.sin(t - beta)) / np.maximum(np.sin(t), 1e-12) - 1
+    below, response = inside > 0, np.stack([np.maximum(np.cos(t - beta), 0.0), np.ones_like(beta)])
+    first = np.append(0, np.cumsum(below.sum(1))[:-1])
+    return np.nonzero(below)[1], first, (response * inside)[:, below], np.maximum(excess, 0.0)[below]
 
 
-def _lamp_rings(water: BandWater, distance_m: float, receiver: Receiver) -> Array:
-    """Returns the light (ANGLES,) scattered once in each ring of the angle at the lamp, divided by b d exp(-a d)."""
-    width, excess = _lamp_geometry(receiver)
-    density = _phase_on_rings(water.scatterer, np.pi) * np.diff(_rings(np.pi))
-    return 2 * np.pi * density @ (width * np.exp(-water.absorption_per_m * distance_m * excess))
+@lru_cache(maxsize=8)
+def _lamp_rings(water: BandWater, distances_m: tuple[float, ...]) -> Array:
+    """Returns the light (2, n, ANGLES) scattered once in rings of the angle at the lamp, divided by b d exp(-a d)."""
+    ring, first, width, excess = _lamp_geometry()  # of floor and particle
+    density = 2 * np.pi * _phase_on_rings(water.scatterer, np.pi) * np.diff(_rings(np.pi))
+    passed = np.exp(-water.absorption_per_m * np.array(distances_m)[:, None] * excess)
+    return np.array([np.add.reduceat(passed * light, first, axis=1) for light in width * density[ring]])
 
 
 @cache
