@@ -11,6 +11,7 @@ from twin.core.geometry import Array
 
 #: Largest number of floor heights that `least_clearance` samples.
 MAX_CLEARANCE_SAMPLES = 20_000_000
+_ROWS_AT_ONCE = 32  # limits the memory on a large floor
 
 
 class Forecast(NamedTuple):
@@ -76,14 +77,18 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
     area_m2 = (north - south) * (np.ptp(path[:, 0]) + 2 * along_m)
     sample_m = max(sample_m, math.sqrt(area_m2 / MAX_CLEARANCE_SAMPLES))
     path = _without_gaps(path, 2 * across_m)
-    # Processed row by row to limit memory on a large floor.
-    tops = []
-    for y in np.linspace(south, north, round((north - south) / sample_m) + 2):
+
+    def row(y: float) -> Array:
         near = path[np.abs(path[:, 1] - y) <= across_m + 1e-9, 0]
         west, east = near.min() - along_m, near.max() + along_m
         x = np.linspace(west, east, round((east - west) / sample_m) + 2)
-        row = np.nan_to_num(height_at(*plan.area.to_scene(x, np.full_like(x, y))), nan=-np.inf)
-        tops.append((float(row.max()), float(x[row.argmax()]), float(y)))
+        return np.stack([x, np.full_like(x, y)])
+
+    across, tops = np.linspace(south, north, round((north - south) / sample_m) + 2).tolist(), []
+    for k in range(0, len(across), _ROWS_AT_ONCE):
+        x, y = np.concatenate([row(at) for at in across[k : k + _ROWS_AT_ONCE]], axis=1)
+        height_m = np.nan_to_num(height_at(*plan.area.to_scene(x, y)), nan=-np.inf)
+        tops.append(np.array([height_m, x, y])[:, height_m.argmax()].tolist())
     height, u, v = max(tops)
     x, y = (float(c) for c in plan.area.to_scene(u, v))
     return Clearance(plan.request.altitude_m - height, x, y, inside=bool(np.isfinite(height_at(*outline.T)).all()))

@@ -5,6 +5,7 @@ import os
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -182,6 +183,11 @@ def input_files(scenario: Scenario) -> list[Path]:
     return list(named("", scenario.model_dump(mode="json", exclude_none=True)))
 
 
+@lru_cache(maxsize=16)  # the surveys of a study read the same files
+def _parsed(text: str) -> tuple[dict[str, Any], dict[str, int]]:
+    return parse_toml(text), key_lines(text)
+
+
 def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
     """Returns the keys and values of one TOML file, and the line number of each dotted key (`key_lines`).
 
@@ -192,12 +198,11 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
     except TwinError as error:
         raise ScenarioError([f"{file}:1: {error.problem}"]) from None
     try:
-        tree = parse_toml(text)
+        tree, lines = copy.deepcopy(_parsed(text))
     except ValueError as error:
         line = re.search(r"line (\d+)", str(error))
         number = line[1] if line else min(len(text.splitlines()), text.count("\n") + 1)
         raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
-    lines = key_lines(text)
     if errors := [Source(path=file, lines=lines).describe(error) for error in islice(value_errors(tree), _MAX_ERRORS)]:
         raise ScenarioError(errors)
     return tree, lines
