@@ -85,15 +85,10 @@ class Navigator:
     """
 
     def __init__(
-        self,
-        rig: StereoRig,
-        settings: EstimatorSettings | None = None,
-        start: Array | None = None,
-        readings_noise: SensorNoise | None = None,
-        vision: Vision | None = None,
-        folder: Path | None = None,
+        self, rig: StereoRig, settings: EstimatorSettings | None = None, start: Array | None = None,
+        readings_noise: SensorNoise | None = None, vision: Vision | None = None, folder: Path | None = None,
         stopwatch: StageTimer | None = None,
-    ):
+    ):  # fmt: skip
         self.rig, self.settings = rig, settings or EstimatorSettings()
         self.stopwatch, noise = stopwatch or Stopwatch(), readings_noise or SensorNoise()
         self._resources = _limited_resources()
@@ -429,12 +424,9 @@ class Navigator:
         )
 
     def build_map(
-        self,
-        result: SurveyResult,
-        grid: MapGrid | None = None,
-        progress: Callable[[float], None] | None = None,
+        self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None,
         chosen: NDArray[np.bool_] | None = None,
-    ) -> ElevationMap | None:
+    ) -> ElevationMap | None:  # fmt: skip
         """Builds the elevation map along the final trajectory, from all keyframes but `SurveyResult.unlinked`.
 
         Heights are measured along z of the world if the optical axis of the first keyframe is within 45 degrees of
@@ -487,13 +479,9 @@ class Navigator:
             report((k + 1) / len(tiles))
 
     def orthomosaic(
-        self,
-        result: SurveyResult,
-        elevation: ElevationMap,
-        restore: Restore | None = None,
-        progress: Callable[[float], None] | None = None,
-        chosen: NDArray[np.bool_] | None = None,
-    ) -> Iterator[OrthoTile] | None:
+        self, result: SurveyResult, elevation: ElevationMap, restore: Restore | None = None,
+        progress: Callable[[float], None] | None = None, chosen: NDArray[np.bool_] | None = None,
+    ) -> Iterator[OrthoTile] | None:  # fmt: skip
         """Returns an iterator over the tiles of the orthomosaic of the keyframe images; None if there are no images.
 
         Args:

@@ -54,14 +54,9 @@ class ImageFormation:
     """Model of the light that reaches each rendered camera (`rig` None: as believed); `floor` None: smooth."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        illumination: Illumination,
-        floor: Heights | None,
-        snow_rng: np.random.Generator,
-        rig: StereoRig | None = None,
-        objects: Objects | None = None,
-    ):
+        self, scenario: Scenario, illumination: Illumination, floor: Heights | None, snow_rng: np.random.Generator,
+        rig: StereoRig | None = None, objects: Objects | None = None,
+    ):  # fmt: skip
         rig = scenario.believed_rig() if rig is None else rig
         imaging, snow, (water, daylight) = scenario.imaging, scenario.snow, illumination
         current_mps = np.array(scenario.current.velocity_mps)

@@ -53,15 +53,9 @@ class StereoCamera:
     """Stereo camera: both cameras share one auto-exposure; their noise is independent."""
 
     def __init__(
-        self,
-        renderer: "Renderer",
-        image_formation: ImageFormation,
-        scenario: Scenario,
-        left_rng: np.random.Generator,
-        right_rng: np.random.Generator,
-        stopwatch: StageTimer,
-        true_cameras: TrueCameras | None = None,
-    ):
+        self, renderer: "Renderer", image_formation: ImageFormation, scenario: Scenario, left_rng: np.random.Generator,
+        right_rng: np.random.Generator, stopwatch: StageTimer, true_cameras: TrueCameras | None = None,
+    ):  # fmt: skip
         self._cameras = make_true_cameras(scenario) if true_cameras is None else true_cameras
         rig = self._cameras.rendered_rig
         self._renderer, self._image_formation = renderer, image_formation
@@ -164,14 +158,9 @@ class StereoCamera:
 
 
 def light_after_lens(
-    formation: ImageFormation,
-    psf: LensPsf,
-    view: RenderedView,
-    light: Radiance,
-    focal_px: float,
-    motion: ExposureMotion | None,
-    snow: bool = True,
-) -> Radiance:
+    formation: ImageFormation, psf: LensPsf, view: RenderedView, light: Radiance, focal_px: float,
+    motion: ExposureMotion | None, snow: bool = True,
+) -> Radiance:  # fmt: skip
     """Returns the light (H, W, 3) of a view, given without snow (may be overwritten), behind a moving camera's lens.
 
     Marine snow, which has other depths and velocities, is drawn with its own blur after lens and motion.

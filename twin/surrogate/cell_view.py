@@ -110,7 +110,7 @@ def _right_camera(cameras, true):
     return right
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _seen(cells, cameras, cell, point, camera_from_world, left, right):
     """Returns depth, column, row of a cell's floor point on the left, and its distance from a border, < 0 if unseen."""
     focal_px, baseline_m = cameras.focal_px, cameras.baseline_m
@@ -192,7 +192,7 @@ def extend_runs(runs, index, border_px, information, following, squared_step):
     return ended[:n], of_ended
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _source(cells, cameras, cell, camera_from_world, estimated):
     """Returns the true floor point that is mapped to a cell: its centre minus the mapping error."""
     # with calibration errors or an approximated port, the estimated pose determines it
@@ -204,13 +204,13 @@ def _source(cells, cameras, cell, camera_from_world, estimated):
     return x - right, y - up, z - (cells.slope[cell, 0] * right + cells.slope[cell, 1] * up)
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _centre(cells, cell):
     x = cells.west_m + (cell % cells.cols + 0.5) * cells.cell_m
     return x, cells.north_m - (cell // cells.cols + 0.5) * cells.cell_m, np.float64(cells.height_m[cell])
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _mapped(cameras, camera_from_world, estimated, point):
     """Returns the estimated position of a world point that a keyframe sees."""
     x, y, d = _normalised(camera_from_world, cameras.baseline_m, point)
@@ -218,7 +218,7 @@ def _mapped(cameras, camera_from_world, estimated, point):
     return _transformed(estimated, seen[0], seen[1], 1.0, cameras.estimated_baseline_m / seen[2])
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _normalised(camera_from_world, baseline_m, point):
     """Returns normalised x, y and disparity of a world point; NaN for a point behind the camera."""
     x, y, z = _transformed(camera_from_world, point[0], point[1], point[2], 1.0)
@@ -226,7 +226,7 @@ def _normalised(camera_from_world, baseline_m, point):
     return x / z, y / z, baseline_m / z
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _transformed(pose, x, y, z, scale):
     return (
         (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z) * scale + pose[0, 3],
@@ -235,7 +235,7 @@ def _transformed(pose, x, y, z, scale):
     )
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _interpolated(table, across, down):
     """Returns the value of a table (rows, cols) of blocks of the image, interpolated between their centres."""
     rows, cols = table.shape

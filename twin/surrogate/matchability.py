@@ -168,12 +168,9 @@ class Matchability:
 
     @np.errstate(invalid="raise")
     def __init__(
-        self,
-        scenario: Scenario,
-        illumination: Illumination,
-        terrain: terrains.Terrain,
+        self, scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain,
         locate: Callable[[Array], Array] | None = None,
-    ):
+    ):  # fmt: skip
         nearest = max(scenario.plan.altitude_m - terrain.highest_m, 0.3)
         highest_m = scenario.plan.altitude_m  # of the cameras
         if scenario.plan.height == "floor":
@@ -302,12 +299,9 @@ def window_texture(signal: NDArray[np.floating], relative_gradients: Array) -> W
 
 
 def unevenness_px(
-    scenario: Scenario,
-    terrain: terrains.Terrain,
-    depths_m: Array,
-    locate: Callable[[Array], Array] | None = None,
+    scenario: Scenario, terrain: terrains.Terrain, depths_m: Array, locate: Callable[[Array], Array] | None = None,
     binning: int = 1,
-) -> Array:
+) -> Array:  # fmt: skip
     """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], an RMS over the planned area.
 
     The unevenness of a patch is the RMS parallax relative to its best-fit plane, in pixels per unit of baseline /

@@ -172,7 +172,7 @@ def _flow(points: Array, baseline_m: float, image_of) -> Array:
     return ((ahead - back) / (2 * scale[:, None])).T
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def measure_point(table, x, y, disparity):
     """Returns the measured x, y, disparity and row difference of a true point; the table is extrapolated linearly."""
     m0, m1, m2, m3 = x, y, disparity, 0.0
@@ -183,7 +183,7 @@ def measure_point(table, x, y, disparity):
     return m0, m1 + turned / 2, m2 - table.yaw_rad * (1 + right * right), m3 + turned
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _interpolated(table, x, y, disparity):
     values = table.values
     n, rows, cols, _ = values.shape
@@ -196,15 +196,12 @@ def _interpolated(table, x, y, disparity):
         for j in range(2):
             wj = wi * (b if j else 1 - b)
             for h in range(2):
-                w = wj * (e if h else 1 - e)
-                m0 += w * values[c + i, r + j, k + h, 0]
-                m1 += w * values[c + i, r + j, k + h, 1]
-                m2 += w * values[c + i, r + j, k + h, 2]
-                m3 += w * values[c + i, r + j, k + h, 3]
+                w, at = wj * (e if h else 1 - e), values[c + i, r + j, k + h]
+                m0, m1, m2, m3 = m0 + w * at[0], m1 + w * at[1], m2 + w * at[2], m3 + w * at[3]
     return m0, m1, m2, m3
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, forceinline=True)
 def _interval(position, n):
     """Returns the index of the grid interval that contains a position, and the relative position in it."""
     k = min(max(int(np.floor(position)), 0), n - 2)
