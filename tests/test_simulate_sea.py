@@ -210,7 +210,7 @@ def integrated(section, sea, start, commands, period_s):
         commanded_rad = np.zeros(len(section.fins))
         commanded_rad[most_rad > 0] = command[n:] * most_rad[most_rad > 0]
         span = k * period_s, (k + 1) * period_s
-        found = solve_ivp(rates, span, state, "DOP853", args=(steady_n, commanded_rad), rtol=1e-9, atol=1e-9)
+        found = solve_ivp(rates, span, state, "DOP853", args=(steady_n, commanded_rad), rtol=1e-8, atol=1e-8)
         state = found.y[:, -1]
     rotation = geometry.rotation_from_wxyz(state[3:7] / np.linalg.norm(state[3:7]))
     return geometry.pose(rotation, state[:3]), state[7:13]
