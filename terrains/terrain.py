@@ -99,6 +99,7 @@ class Terrain:
 
     @property
     def texture(self) -> Image:
+        """Returns `colours` as an image, painted at the first call."""
         return self.colours.image if isinstance(self.colours, PaintedTexture) else self.colours
 
     @property

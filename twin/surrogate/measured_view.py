@@ -246,10 +246,8 @@ class MeasuredRows:
         # the ratio of `stereo.row_noise_ratio`, but for any number of points; `points` (n, 3) are true ones that
         # represent `observation.n_points` matches, `sigma_px` is the standard deviation of a match in one image [px]
         measured, row_sigma_px = self._view.measure_with_rows(points), np.sqrt(2) * sigma_px
-        rows_px, of_raster = (
-            measured[:, 3] * self._rig.focal_px,
-            row_sigma_px * np.sqrt(len(points) / observation.n_points),
-        )
+        rows_px = measured[:, 3] * self._rig.focal_px
+        of_raster = row_sigma_px * np.sqrt(len(points) / observation.n_points)
         self._add(measured, rows_px + of_raster * self._rng.standard_normal(len(points)), of_raster)
         offset_px = float(np.median(rows_px))
         spread_px = float(np.hypot(row_sigma_px, _MAD_TO_SIGMA * np.median(np.abs(rows_px - offset_px))))
