@@ -218,6 +218,6 @@ def test_the_number_of_independent_errors_predicts_how_much_the_mean_nees_of_sur
 def test_independent_and_common_errors_are_counted_exactly():
     rng, covs = np.random.default_rng(0), np.tile(np.diag([1.0, 4.0, 9.0]), (20, 1, 1))
     single = rng.normal(size=(20, 3, 20000)) * np.array([1, 2, 3])[:, None]
-    assert alignment._independent_errors(single, covs) == pytest.approx(20, rel=0.04)
-    assert alignment._independent_errors(np.repeat(single[:1], 20, axis=0), covs) == pytest.approx(1, rel=0.04)
-    assert alignment._independent_errors(single, 0 * covs) is None
+    assert alignment._independent_errors([single], covs) == pytest.approx(20, rel=0.04)
+    assert alignment._independent_errors([np.repeat(single[:1], 20, axis=0)], covs) == pytest.approx(1, rel=0.04)
+    assert alignment._independent_errors([single], 0 * covs) is None

@@ -42,7 +42,9 @@ def map_model_over(height_m, bound_px=0.0, dependence=NO_DEPENDENCE, texture=EVE
         bound_at=lambda depth_m: np.full(np.shape(depth_m), bound_px),
     )  # fmt: skip
     floor = height_field(height_m, 0.02, west, west)
-    return MapModel(grid, height_m[::-1].astype(np.float32), RIG, floor, matchability)
+    model = MapModel(grid, height_m[::-1].astype(np.float32), RIG, floor, matchability)
+    model.keep_conditions()
+    return model
 
 
 def patch_of(model, errors, pose, next_pose=None, estimated=None, seed=0):

@@ -24,7 +24,7 @@ _MAX_ROUNDS = 10
 _MAX_ITERATIONS = 100
 _ROUND_ITERATIONS = 10  # iterations per round; the Huber weights converge slowly while the graph has gross outliers
 _DRAWS = 200  # drawn errors of all poses, from which the number of independent errors is estimated to about 15 %
-_DRAWN_AT_ONCE = 20  # of them, to limit memory
+_DRAWN_AT_ONCE = 10  # of them, to limit memory
 _HUBER = 3.0  # threshold of the Huber loss in standard deviations
 
 
@@ -119,19 +119,19 @@ def _mean_chi2(links: Links, chi2: Array) -> float:
     return float(np.mean(chi2 * links.shared_by)) / 6 if len(chi2) else 0.0
 
 
-def _draw_positions(solution: pose_graph.Solution) -> Array:
-    """Returns errors (n - 1, 3, `_DRAWS`) of the positions of all nodes but the first, the reference [m]."""
+def _draw_positions(solution: pose_graph.Solution) -> list[Array]:
+    """Returns draws (n - 1, 3, `_DRAWN_AT_ONCE`) of position errors of all nodes but the first, the reference [m]."""
     rng = np.random.default_rng(0)
-    parts = [solution.sample(_DRAWN_AT_ONCE, rng)[1:, 3:] for _ in range(_DRAWS // _DRAWN_AT_ONCE)]
-    return np.concatenate(parts, axis=2)
+    return [solution.sample(_DRAWN_AT_ONCE, rng)[1:, 3:].copy() for _ in range(_DRAWS // _DRAWN_AT_ONCE)]
 
 
-def _independent_errors(draws: Array, covs: Array) -> float | None:
+def _independent_errors(draws: Sequence[Array], covs: Array) -> float | None:
     """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes."""
     # of 3 k squared normal numbers, the sum / k has the variance 6 / k; `draws` (n, 3, m) of the joint covariance [m],
     # `covs` (n, 3, 3) [m2]
     known = np.linalg.eigvalsh(covs)[:, 0] > 0
     if not known.any():
         return None
-    whitened = np.linalg.solve(np.linalg.cholesky(covs[known]), draws[known])
-    return float(6 / np.var(np.sum(whitened**2, axis=(0, 1)) / known.sum()))
+    root = np.linalg.cholesky(covs[known])
+    nees = [np.sum(np.linalg.solve(root, errors[known]) ** 2, axis=(0, 1)) for errors in draws]
+    return float(6 / np.var(np.concatenate(nees) / known.sum()))

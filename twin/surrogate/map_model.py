@@ -63,8 +63,8 @@ class MapModel:
     """Samples the height patch of each keyframe: true heights (rows, cols) of the floor plus errors.
 
     `rig` is the believed calibration, at the scale of the matched images; rays are cast to the true `floor`. `seen`
-    (rows, cols) masks the cells that at least one keyframe observed; updated by `mark_seen`. Of each cell, (rows *
-    cols,), `conditions` are those of the latest height, and `n_heights` the number of fused heights.
+    (rows, cols) masks the cells that at least one keyframe observed; updated by `mark_seen`. After `keep_conditions`, of
+    each cell, (rows * cols,), `conditions` are those of the latest height, and `n_heights` the number of fused heights.
     """
 
     def __init__(
@@ -83,9 +83,12 @@ class MapModel:
             rig.baseline_m, 1 / np.square(matchability.dependence.bounds),
         )  # fmt: skip
         self._lowest_m = float(np.nanmin(height_m))
-        self._conditions = np.zeros((len(CellConditions._fields), height_m.size))
-        self.n_heights = np.zeros(height_m.size, np.int64)
+        self._conditions, self.n_heights = np.zeros((len(CellConditions._fields), 0)), np.zeros(0, np.int64)
         self._runs = np.zeros((4, height_m.size))  # see `extend_runs`
+
+    def keep_conditions(self) -> None:
+        self._conditions = np.zeros((len(CellConditions._fields), self.height_m.size))
+        self.n_heights = np.zeros(self.height_m.size, np.int64)
 
     @property
     def conditions(self) -> CellConditions:
@@ -172,8 +175,9 @@ class MapModel:
         last, step = index[ended], np.sqrt(squared_steps / np.maximum(number - 1, 1))
         views = KeyframeRuns(observed.depth_m[ended], number, step, border_px, np.sqrt(number / information))
         cells = cell_conditions(self._matchability, self._rig, self.relief, last, views)
-        self._conditions[:, last] = cells
-        self.n_heights[last] += 1
+        if self.n_heights.size:
+            self._conditions[:, last] = cells
+            self.n_heights[last] += 1
         return last, cells
 
     def _pose_variances(self, estimated: Array, cov: Array, index: Index) -> Array:

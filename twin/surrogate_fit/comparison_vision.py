@@ -170,6 +170,7 @@ class ComparisonVision:
         # cancel; only cells to which one patch contributed are compared
         found, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         self.surrogate.model = exact_map_model(model)
+        self.surrogate.map_model.keep_conditions()
         exact = self.surrogate.build_map(result, grid, step_cov, lambda _: None)
         self.surrogate.model = model
         map_model = self.surrogate.map_model

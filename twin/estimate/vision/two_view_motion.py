@@ -24,6 +24,7 @@ from twin.estimate.vision.observation_equations import (
     normal_equations,
     transfer,
 )
+from twin.kernels import kernel
 
 HUBER = 1.5
 #: Prior standard deviation of the amplitude of pixel locking (`patches.locking_shifts`) [px]: the root mean square of
@@ -37,7 +38,8 @@ _CLOSED_FORMS = 4  # iterations of `exact_depth_motion`
 CUTOFF = 4.0  # residuals of `pair_motion` beyond this many standard deviations have zero weight
 _PRIOR_POINTS = 50  # weight of the expected covariance of the scores in `_scatter_cov`, as a number of points
 _MIN_SCALE = 0.3  # smallest factor on reported standard deviations, for noise-free data
-_MEDIAN_NORMALISED = {2: 0.680, 3: 0.888}  # sqrt(median of chi2 / 3) by degrees of freedom
+_NORMALISED_MEDIANS = 0.680, 0.888  # sqrt(median of chi2 / 3) for 2 and 3 degrees of freedom
+_NO_LOCKING = PixelLocking(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 class Motion(NamedTuple):
@@ -103,11 +105,12 @@ def _iterate_closed_form(a: Array, b: Array, baseline_m: float, guess: Array) ->
         residual = a[:, :2] - np.stack([x, y], axis=1)
         length = np.linalg.norm(residual, axis=1)
         sigma = max(float(np.median(length)) / 1.1774, 1e-7)  # median of a Rayleigh distribution
-        weight = _huber_weights(length, sigma, cutoff=5.0)
+        weight = _huber_weights(length, sigma, 5.0)
         b_from_a = b_from_a @ geometry.exp(closed_form_motion(x, y, xyz[:, 2], residual, weight))
     return None if np.count_nonzero(weight) < _MIN_POINTS else geometry.inverse(b_from_a)
 
 
+@kernel
 def _huber_weights(size: Array, sigma: float, cutoff: float) -> Array:
     return np.minimum(1.0, HUBER * sigma / np.maximum(size, 1e-12)) * (size < cutoff * sigma)
 
@@ -141,22 +144,13 @@ def _adjust_pair(
     measured: PairMeasurements, baseline_m: float, guess: Array, settings: PairMotionSettings
 ) -> Motion | None:
     """Returns the motion of `pair_motion`, which is not finite if the Gauss-Newton iteration diverges."""
-    a_from_b, amplitude_px, structure = guess, 0.0, measured.b.copy()
-    normals = None
-    for _ in range(_ITERATIONS):
-        observations = linearise(measured, structure, a_from_b, baseline_m)
-        if settings.locking is not None:
-            observations = _with_locking(observations, settings.locking, amplitude_px)
-        normals = _weighted_normals(observations, amplitude_px, settings)
-        update = np.asarray(np.linalg.solve(normals.normal, normals.right), np.float64)
-        structure = adjust_structure(observations, measured, update)
-        a_from_b = a_from_b @ geometry.exp(update[:6])
-        amplitude_px += float(update[6:].sum())
-        if update @ normals.normal @ update < (_CONVERGED * normals.scale) ** 2:
-            break
+    locking = settings.locking or _NO_LOCKING
+    arrays = (np.ascontiguousarray(values, np.float64) for values in (*measured, *locking, guess))
+    a_from_b, amplitude_px, structure, normals = _iterate(*arrays, baseline_m, settings.n_measured)
+    normals = _WeightedNormals(*normals)
     if abs(amplitude_px) > MAX_LOCKING_PX:
         return _adjust_pair(measured, baseline_m, guess, settings._replace(locking=None))
-    if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
+    if np.count_nonzero(normals.weight) < _MIN_POINTS:
         return None
     motion = Motion(a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale)
     if settings.n_measured < 3:
@@ -181,30 +175,48 @@ class _WeightedNormals(NamedTuple):
     bias_jacobian: Array  #: (p, 3) derivative of `right` with respect to the common biases of x, y and disparity
 
 
-def _with_locking(
-    observations: LinearisedObservations, locking: PixelLocking, amplitude_px: float
-) -> LinearisedObservations:
+@kernel
+def _iterate(a, b, cov_a, cov_b, locking_a, locking_b, guess, baseline_m, n_measured):
+    """Returns motion, amplitude of locking [px], structure, and `_WeightedNormals` before the last step."""
+    measured, a_from_b, amplitude_px, structure = PairMeasurements(a, b, cov_a, cov_b), guess, 0.0, b
+    for _ in range(_ITERATIONS):
+        observations = linearise(measured, structure, a_from_b, baseline_m)
+        if len(locking_a):
+            observations = _with_locking(observations, locking_a, locking_b, amplitude_px)
+        normals = _weighted_normals(observations, amplitude_px, n_measured)
+        update = np.linalg.solve(normals.normal, normals.right)
+        structure = adjust_structure(observations, measured, update)
+        a_from_b = geometry.compose(a_from_b, geometry.exp(update[:6]))
+        amplitude_px += np.sum(update[6:])
+        if np.sum(update * (normals.normal @ update)) < (_CONVERGED * normals.scale) ** 2:
+            break
+    return a_from_b, amplitude_px, structure, normals
+
+
+@kernel
+def _with_locking(observations, locking_a, locking_b, amplitude_px):
     """Returns the observations with pixel locking as seventh unknown, linearised and reduced at `amplitude_px`."""
-    moved = np.einsum("nij,nj->ni", observations.jacobian_point, locking.b)
-    derivative = locking.a - moved  # of the predicted measurements with respect to the amplitude
-    residual = observations.residual - derivative * amplitude_px
-    chi2 = np.einsum("ni,nij,nj->n", residual, observations.information, residual)
-    return observations._replace(
-        residual=residual,
-        jacobian_motion=np.concatenate([observations.jacobian_motion, derivative[:, :, None]], axis=2),
-        normalised_residual=np.sqrt(chi2 / 3),
-    )
+    residual, n = observations.residual, len(locking_a)
+    jacobian, size = np.empty((n, 3, 7)), np.empty(n)
+    for i in range(n):
+        for r in range(3):
+            jacobian[i, r, :6] = observations.jacobian_motion[i, r]
+            jacobian[i, r, 6] = locking_a[i, r]  # derivative of the predicted measurements by the amplitude
+            for c in range(3):
+                jacobian[i, r, 6] -= observations.jacobian_point[i, r, c] * locking_b[i, c]
+            residual[i, r] -= jacobian[i, r, 6] * amplitude_px
+        size[i] = np.sqrt(np.sum(residual[i] * (observations.information[i] @ residual[i])) / 3)
+    return LinearisedObservations(residual, observations.jacobian_point, jacobian, observations.information, size)
 
 
-def _weighted_normals(
-    observations: LinearisedObservations, amplitude_px: float, settings: PairMotionSettings
-) -> _WeightedNormals:
+@kernel
+def _weighted_normals(observations, amplitude_px, n_measured):
     size = observations.normalised_residual
-    scale = max(float(np.median(size)) / _MEDIAN_NORMALISED[settings.n_measured], 1e-3)
+    scale = max(np.median(size) / _NORMALISED_MEDIANS[n_measured - 2], 1e-3)
     weight = _huber_weights(size, scale, CUTOFF)
     normal, right, bias_jacobian = motion_normal_equations(observations, weight)
     prior = np.zeros_like(normal)
-    if settings.locking is not None:
+    if len(normal) > 6:
         prior[6, 6] = (scale / _LOCKING_SIGMA_PX) ** 2  # weights are relative to residuals of variance scale^2
         right[6] -= prior[6, 6] * amplitude_px
     return _WeightedNormals(observations, weight, scale, normal + prior, prior, right, bias_jacobian)
@@ -285,7 +297,8 @@ def _additional_unknown(
     return (score - float(by_unknowns @ normals.right)) / remaining, variance**0.5, -by_unknowns[:6]
 
 
-def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
+@kernel
+def _scatter_cov(normals, n_measured):
     """Returns the covariance (p, p) of the unknowns from the residuals of the individual points.
 
     Sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, section 7.6; White 1980). S sums the
@@ -295,15 +308,20 @@ def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     counts as 50 points. Prior information is added to M and, times the squared scale, to S.
     """
     observations, weight, scale = normals.observations, normals.weight, normals.scale
-    size, n, p = observations.normalised_residual, int(np.count_nonzero(weight)), len(normals.normal)
-    information = normals.normal - normals.prior
-    score = np.einsum("nrp,nrc,nc->np", observations.jacobian_motion, observations.information, observations.residual)
-    score *= weight[:, None]
+    size, n, p = observations.normalised_residual, np.count_nonzero(weight), len(normals.normal)
+    information, scores = normals.normal - normals.prior, np.zeros((len(weight), p))
+    for i in range(len(weight)):
+        for r in range(3):
+            weighted = 0.0
+            for c in range(3):
+                weighted += weight[i] * observations.information[i, r, c] * observations.residual[i, c]
+            for k in range(p):
+                scores[i, k] += observations.jacobian_motion[i, r, k] * weighted
     freedom = n_measured * n / max(n_measured * n - p, 1)
-    mean_square = float(np.sum((weight * size) ** 2) / np.sum(weight))  # expected: n_measured / 3
+    mean_square = np.sum((weight * size) ** 2) / np.sum(weight)  # expected: n_measured / 3
     variance = max(mean_square * 3 / n_measured, _MIN_SCALE**2)
-    scatter = freedom * (n * (score.T @ score) + _PRIOR_POINTS * variance * information) / (n + _PRIOR_POINTS)
+    scatter = freedom * (n * (scores.T @ scores) + _PRIOR_POINTS * variance * information) / (n + _PRIOR_POINTS)
     core = size < HUBER * scale
-    efficiency = float(np.sum(weight * np.where(core, 1.0, 1 - 1 / n_measured)) / np.sum(weight))
+    efficiency = np.sum(weight * np.where(core, 1.0, 1 - 1 / n_measured)) / np.sum(weight)
     bread = np.linalg.inv(information * efficiency + normals.prior)
-    return np.asarray(bread @ (scatter + normals.prior * scale**2) @ bread, np.float64)
+    return bread @ (scatter + normals.prior * scale**2) @ bread
