@@ -26,7 +26,9 @@ SPIKES = types.SimpleNamespace(
 )
 
 
-@pytest.mark.parametrize(("n_rows", "rows_per_row", "n_bands"), [(63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1)])
+@pytest.mark.parametrize(("n_rows", "rows_per_row", "n_bands"), [
+    (63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1), (240, threads.QUICK, 1), (480, threads.QUICK, 2),
+])  # fmt: skip
 def test_an_image_is_split_where_it_has_enough_rows(monkeypatch, n_rows, rows_per_row, n_bands):
     monkeypatch.setattr(threads, "_n_processors", lambda: threads.THREADS)
     bands = []

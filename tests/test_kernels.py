@@ -82,6 +82,14 @@ def test_an_edit_of_a_called_function_or_of_a_constant_in_another_file_is_seen(p
     assert run(package) == (-6.5, 1)
 
 
+def test_kept_code_is_read_in_its_intermediate_form_only_for_another_compilation(package):
+    code = "import numba; from twin.caller import apply; apply(8.0); "
+    code += "library = next(iter(apply.overloads.values())).library; print(library._shared_module is None); "
+    code += "print(numba.njit(lambda x: 2 * apply(x))(8.0), library._shared_module is None)"
+    assert printed(package, "-c", code) == ["False", "10.0", "False"]  # compiled
+    assert printed(package, "-c", code) == ["True", "10.0", "False"]  # from the disk
+
+
 def test_whether_a_module_has_compiled_code_is_known_without_its_import(package):
     command = "-c", "from twin.kernels import has_code; print(has_code('twin.callee'))"
     assert printed(package, *command) == ["False"]

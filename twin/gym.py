@@ -130,14 +130,10 @@ class SeabedTwinEnv(_SurveyEnv):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 3}
 
     def __init__(
-        self,
-        scenario: str = "quickstart",
-        overrides: Sequence[str] = (),
-        action: Literal["velocity", "thrust"] = "velocity",
-        reward: Literal["coverage", "track"] = "coverage",
-        render_mode: str | None = None,
-        allow_plugins: bool = False,
-    ):
+        self, scenario: str = "quickstart", overrides: Sequence[str] = (),
+        action: Literal["velocity", "thrust"] = "velocity", reward: Literal["coverage", "track"] = "coverage",
+        render_mode: str | None = None, allow_plugins: bool = False,
+    ):  # fmt: skip
         given = load_scenario(scenario, overrides, allow_plugins)
         if given.imaging.fidelity != "rendered":
             raise TwinError("imaging.fidelity", f"{given.imaging.fidelity!r} has no images", '"rendered"')
@@ -255,15 +251,12 @@ class SeabedTwinStateEnv(_SurveyEnv):
     metadata: dict[str, Any] = {"render_modes": []}
 
     def __init__(
-        self,
-        scenario: str = "quickstart",
-        overrides: Sequence[str] = (),
+        self, scenario: str = "quickstart", overrides: Sequence[str] = (),
         action: Literal["velocity", "thrust"] = "velocity",
         observe: Sequence[str] = ("pose", "velocity", "reference"),
         reward: Literal["track"] | Callable[["SeabedTwinStateEnv"], float] = "track",
-        frames: int = 1,
-        allow_plugins: bool = False,
-    ):
+        frames: int = 1, allow_plugins: bool = False,
+    ):  # fmt: skip
         surrogate = ["imaging.fidelity=surrogate", "imaging.extrapolate=true"]
         given = load_scenario(scenario, [*overrides, *surrogate], allow_plugins)
         if unknown := [name for name in observe if name not in _BOUNDS]:

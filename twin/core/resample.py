@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twin.core.interpolation import bspline_weights
 from twin.core.records import Image
-from twin.core.threads import in_row_bands
+from twin.core.threads import QUICK, in_row_bands
 from twin.core.vector_math import sum_of_pixels
 from twin.kernels import kernel
 
@@ -35,10 +35,10 @@ def interpolate(image: Image, positions: Positions) -> Image:
 def spline_coefficients(image: NDArray[Any]) -> NDArray[np.float32]:
     """Returns the coefficients (H, 3 W) of the cubic B-spline through the pixels of an image (H, W, 3)."""
     spline = image.reshape(len(image), -1).astype(np.float32)
-    in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
+    in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1], QUICK)
     wide = cv2.copyMakeBorder(spline.reshape(image.shape), 0, 0, TAPS, TAPS, cv2.BORDER_REFLECT_101)
     flat = wide.reshape(len(wide), -1)
-    in_row_bands(lambda first, end: _filter_rows(flat, spline, first, end), len(spline))
+    in_row_bands(lambda first, end: _filter_rows(flat, spline, first, end), len(spline), QUICK)
     return spline
 
 

@@ -42,14 +42,9 @@ class AlignmentResult(NamedTuple):
 
 
 def align(
-    nodes: Sequence[Keyframe],
-    links: Sequence[Link],
-    anchors: dict[int, Array],
-    rig: StereoRig,
-    noise: SensorNoise,
-    marginals_of: Sequence[int] | None = None,
-    measured: MeasuredErrors = NOTHING_MEASURED,
-) -> AlignmentResult:
+    nodes: Sequence[Keyframe], links: Sequence[Link], anchors: dict[int, Array], rig: StereoRig, noise: SensorNoise,
+    marginals_of: Sequence[int] | None = None, measured: MeasuredErrors = NOTHING_MEASURED,
+) -> AlignmentResult:  # fmt: skip
     """Returns the maximum-likelihood poses of a window of nodes, their covariances, and the links removed as outliers.
 
     The poses of the nodes are the initial values; `anchors` are prior covariances (6, 6) [rotation, translation] (rad,

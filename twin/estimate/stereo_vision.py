@@ -57,14 +57,9 @@ class StereoVision:
     runs_in_background = True  # matching takes long enough to justify a separate thread
 
     def __init__(
-        self,
-        rig: StereoRig,
-        settings: EstimatorSettings,
-        folder: Path,
-        cell_m: float | None = None,
-        stopwatch: StageTimer | None = None,
-        noise: SensorNoise | None = None,
-    ):
+        self, rig: StereoRig, settings: EstimatorSettings, folder: Path, cell_m: float | None = None,
+        stopwatch: StageTimer | None = None, noise: SensorNoise | None = None,
+    ):  # fmt: skip
         noise = noise or SensorNoise()
         self.repeats, self._imu_noise = RepeatedImages(settings.noisy_images, noise), noise.imu
         self.full_rig, self.settings, self.stopwatch = rig.with_square_pixels(), settings, stopwatch or Stopwatch()

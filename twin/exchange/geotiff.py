@@ -91,14 +91,9 @@ def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georefe
 
 
 def _write(
-    path: Path,
-    bands: NDArray[Any],
-    grid: MapGrid,
-    georeference: Georeference | None,
-    descriptions: tuple[str, ...] = (),
-    tags: Mapping[str, str] | None = None,
-    **options: Any,
-) -> None:
+    path: Path, bands: NDArray[Any], grid: MapGrid, georeference: Georeference | None,
+    descriptions: tuple[str, ...] = (), tags: Mapping[str, str] | None = None, **options: Any,
+) -> None:  # fmt: skip
     """Writes bands (n, rows, cols), one by one if they have descriptions and tags; `options` are those of rasterio."""
     layout = profile(grid, len(bands), str(bands.dtype), georeference)
     with rasterio.open(path, "w", **layout, **options) as file:

@@ -63,8 +63,8 @@ class MapModel:
     """Samples the height patch of each keyframe: true heights (rows, cols) of the floor plus errors.
 
     `rig` is the believed calibration, at the scale of the matched images; rays are cast to the true `floor`. `seen`
-    (rows, cols) masks the cells that at least one keyframe observed; updated by `mark_seen`. After `keep_conditions`, of
-    each cell, (rows * cols,), `conditions` are those of the latest height, and `n_heights` the number of fused heights.
+    (rows, cols) masks the cells that at least one keyframe observed; updated by `mark_seen`. After `keep_conditions`,
+    `conditions` are those of the latest height of each cell, (rows * cols,), and `n_heights` its number of heights.
     """
 
     def __init__(

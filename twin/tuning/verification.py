@@ -83,13 +83,9 @@ class Verification(NamedTuple):
 
 
 def verification_of(
-    rendered: CandidateSurveys,
-    confirmation: CandidateSurveys,
-    surrogate: Candidate,
-    search_round: int,
-    surveys: int,
+    rendered: CandidateSurveys, confirmation: CandidateSurveys, surrogate: Candidate, search_round: int, surveys: int,
     most: int,
-) -> Verification:
+) -> Verification:  # fmt: skip
     """Returns the verification of a plan by its first rendered surveys."""
     number, values = surrogate.number, surrogate.values
     scores, predicted = rendered.scores(number, values, surveys), confirmation.scores(number, values)

@@ -57,14 +57,10 @@ class _FilterState(NamedTuple):
 
 
 def build_map(
-    views: Iterable[MapView],
-    path: KeyframePath,
-    rig: StereoRig,
-    grid: MapGrid,
-    progress: Callable[[int], None] = lambda _: None,
-    pattern: Map = _NO_PATTERN,
+    views: Iterable[MapView], path: KeyframePath, rig: StereoRig, grid: MapGrid,
+    progress: Callable[[int], None] = lambda _: None, pattern: Map = _NO_PATTERN,
     calibration: CalibrationEstimate = EXACT,
-) -> ElevationMap:
+) -> ElevationMap:  # fmt: skip
     """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far."""
     # depths are corrected for the calibration; what remains uncertain of it is part of the standard deviations
     rig = replace(rig, baseline_m=rig.baseline_m * (1 + calibration.baseline_error))

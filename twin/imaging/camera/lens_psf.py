@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Array, Depth, Radiance, StereoRig
-from twin.core.threads import in_row_bands
+from twin.core.threads import QUICK, in_row_bands
 from twin.imaging.camera.port import pinhole
 from twin.imaging.light.spectra import CENTRE_NM
 from twin.kernels import kernel
@@ -98,7 +98,7 @@ class LensPsf:
 
 
 def _run(kernel: Callable[..., None], rows: int, *scene: Any) -> None:
-    in_row_bands(lambda first, end: kernel(*scene, first, end), rows)
+    in_row_bands(lambda first, end: kernel(*scene, first, end), rows, QUICK)
 
 
 def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px: Array) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Array, Exposure, Image, Radiance, StereoRig
-from twin.core.threads import in_row_bands
+from twin.core.threads import QUICK, in_row_bands
 from twin.imaging.camera.photons import electrons_per_cd, vignetting
 from twin.imaging.camera.pixels import Raw, read_out
 from twin.imaging.camera.sensor import METERED, AutoExposure, ExposureSetting, PlainSensor, highlight
@@ -99,7 +99,7 @@ class PhotoSensor:
         tones = self._tone_table(self._white.of_white_light if white is None else np.array(white))
         shading = self._flat, np.float32(self._black_dn), np.float32(self._top_dn)
         bands = raw.reshape(*raw.shape[:2], -1), tones, *shading, toned.reshape(*raw.shape[:2], -1)
-        in_row_bands(lambda first, end: _tone(*bands, first, end), len(raw))
+        in_row_bands(lambda first, end: _tone(*bands, first, end), len(raw), QUICK)
         if raw.ndim == 3:
             return toned
         image = np.empty((*raw.shape, 3), np.uint8)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Array, Depth, Radiance, StereoRig
-from twin.core.threads import in_row_bands
+from twin.core.threads import QUICK, in_row_bands
 from twin.core.vector_math import sum_of_entries
 from twin.imaging.light.phase_function import BandWater
 from twin.imaging.light.shading import FAR_M, RANGE_SCALE_M
@@ -116,7 +116,7 @@ class ForwardScatter:
                 images[k] = images[k][grid.pad : grid.pad + height, grid.pad : grid.pad + width]
         rows, cols = images[0].shape[:2]
         finest = images[0].reshape(rows, 3 * cols), light.reshape(len(light), -1)
-        in_row_bands(lambda first, end: _add_upsampled(*finest, first, end), len(light))
+        in_row_bands(lambda first, end: _add_upsampled(*finest, first, end), len(light), QUICK)
 
     def spread(self, floor: Radiance, range_m: Array, around: tuple[Radiance, Place]) -> Radiance:
         """Returns all light (H, W, 3) of the floor scattered between floor and camera [cd/m2], see `add`."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.height_field import rises
 from twin.core.records import Array, Depth, StereoRig
-from twin.core.threads import in_row_bands
+from twin.core.threads import QUICK, in_row_bands
 from twin.imaging.light.illumination import Daylight
 from twin.imaging.light.optics import Lit
 from twin.imaging.scene.facets import Heights
@@ -48,7 +48,7 @@ class Shadows:
         out = np.empty((len(lamps), *depth.shape), np.uint8)
         pose = np.ascontiguousarray(world_from_camera)
         scene = self._grid, depth, self._rig.focal_px, pose, lamps
-        in_row_bands(lambda first, end: _test_facing(*scene, label, out, first, end), len(depth))
+        in_row_bands(lambda first, end: _test_facing(*scene, label, out, first, end), len(depth), QUICK)
         in_row_bands(lambda first, end: _grow_shadows(*scene, out, first, end), len(lamps), len(depth))
         return out
 
