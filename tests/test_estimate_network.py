@@ -71,7 +71,7 @@ def test_measurements_are_recorded_in_the_order_of_the_nodes_whichever_thread_en
     """Regression: sums over the disparity offsets depended on the order in which two threads appended them."""
     network = connected(Numbered(background, slow_node=3), 6)
     network.truncate(6)
-    names = [offset.estimate for offset in network.history.disparity_offsets]
+    names = network.history.disparity_offsets.array[:, 0].tolist()
     assert names == network.history.link_residuals == [100 * link.j + link.i for link in network.links]
     assert len(names) > 10 and [name // 100 for name in names] == sorted(name // 100 for name in names)
 

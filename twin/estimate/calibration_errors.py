@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -19,10 +20,8 @@ from twin.core.links import Link, Links
 from twin.core.quality import (
     CalibrationEstimate,
     DisparityOffset,
-    DistortionError,
     EpipolarError,
     LengthScale,
-    YawEffect,
 )
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.link_selection import RECURRENCE
@@ -37,25 +36,22 @@ SIGNIFICANT = 4.0  #: standard deviations
 _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many times that of all sensors together
 
 
-def disparity_offset(
-    offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int, n_views: float, focal_px: float
-) -> DisparityOffset | None:
+def disparity_offset(offsets: ArrayLike, n_nodes: int, n_views: float, focal_px: float) -> DisparityOffset | None:
     """Returns the `weighted_mean` of the offsets of the links; None without offsets or nodes, or if not observable."""
-    if not offsets or n_nodes < 1 or np.median([offset.sigma for offset in offsets]) * focal_px > MAX_LINK_SIGMA_PX:
+    offsets = np.reshape(offsets, (-1, 2))
+    if not len(offsets) or n_nodes < 1 or np.median(offsets[:, 1]) * focal_px > MAX_LINK_SIGMA_PX:
         return None
     return DisparityOffset(*weighted_mean(offsets, n_nodes, n_views))
 
 
-def weighted_mean(
-    offsets: Sequence[DisparityOffset | DistortionError | YawEffect], n_nodes: int, n_views: float
-) -> tuple[float, float]:
-    """Returns the weighted mean of estimates by links, with their sigmas of independent links, and its sigma.
+def weighted_mean(offsets: Array, n_nodes: int, n_views: float) -> tuple[float, float]:
+    """Returns the weighted mean of estimates (n, 2) by links, with sigmas of independent links, and its sigma.
 
     The variance is multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes
     that share the errors of relief, with c = `RECURRENCE` and m = `n_views` (`mean_views`), and by the mean chi-square
     if above 1.
     """
-    value, sigma = np.array([offset[:2] for offset in offsets]).T
+    value, sigma = offsets.T.copy()
     weight = sigma**-2
     mean = float(np.sum(weight * value) / np.sum(weight))
     chi2 = float(np.mean(weight * (value - mean) ** 2))

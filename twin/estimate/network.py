@@ -14,6 +14,7 @@ from twin.core.geometry import Array
 from twin.core.links import Link, Links
 from twin.core.quality import CalibrationEstimate, DisparityOffset, DistortionError, YawEffect
 from twin.core.records import Alignment, Displacement, SensorNoise, StereoRig
+from twin.core.series import GrowingArray
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer
 from twin.errors import SurveyAborted
@@ -54,11 +55,11 @@ class AlignmentHistory:
     #: before_ga, after_ga: positions (n, 3) of the keyframes just before and after each alignment of a track [m].
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
-    #: link_residuals, disparity_offsets, yaws, distortions: those of all `LinkAttempt`s, without None; NaN: failed.
-    link_residuals: list[float] = field(default_factory=list[float])
-    disparity_offsets: list[DisparityOffset] = field(default_factory=list[DisparityOffset])
-    yaws: list[YawEffect] = field(default_factory=list[YawEffect])
-    distortions: list[DistortionError] = field(default_factory=list[DistortionError])
+    link_residuals: list[float] = field(default_factory=list[float])  #: those of all `LinkAttempt`s; NaN: failed
+    #: disparity_offsets, yaws, distortions: estimates and sigmas (n, 2) of all `LinkAttempt`s that have them.
+    disparity_offsets: GrowingArray = field(default_factory=lambda: GrowingArray(2))
+    yaws: GrowingArray = field(default_factory=lambda: GrowingArray(2))
+    distortions: GrowingArray = field(default_factory=lambda: GrowingArray(2))
     #: standard deviations (3-D) of positions relative to the previous keyframe, by F2F alone [m], where known.
     frame_sigmas_m: list[float] = field(default_factory=list[float])
     nodes_bridged: int = 0  #: number of nodes whose link to the previous node is the F2F motion
@@ -184,9 +185,9 @@ class KeyframeNetwork:
             self.links.add(links + bridge)
             self.history.link_residuals += [np.nan if a.motion is None else a.motion.residual for a in attempts]
             motions = [attempt.motion for attempt in attempts if attempt.motion is not None]
-            self.history.disparity_offsets += [m.disparity_offset for m in motions if m.disparity_offset is not None]
-            self.history.yaws += [motion.yaw for motion in motions if motion.yaw is not None]
-            self.history.distortions += [motion.distortion for motion in motions if motion.distortion is not None]
+            self.history.disparity_offsets.append([m.disparity_offset for m in motions if m.disparity_offset])
+            self.history.yaws.append([motion.yaw[:2] for motion in motions if motion.yaw])
+            self.history.distortions.append([motion.distortion for motion in motions if motion.distortion])
 
     def align_window(self, track: int) -> Array | None:
         """Aligns the nodes of the window of tracks that ends with `track`, and rebuilds the mosaic from this track.
@@ -241,22 +242,23 @@ class KeyframeNetwork:
     def yaw_rad(self, *latest: YawEffect) -> tuple[float, float]:
         """Returns yaw and sigma [rad] of the right camera by calibration, links, and `latest` not yet among them."""
         pending = [attempt.yaw for _, chain, _ in self._pending for attempt in chain if attempt.yaw is not None]
-        yaws, n_nodes = [*self.history.yaws, *pending, *latest], len(self.nodes) - 1 + len(latest)
+        others = np.reshape([yaw[:2] for yaw in (*pending, *latest)], (-1, 2))
+        yaws, n_nodes = np.concatenate([self.history.yaws.array, others]), len(self.nodes) - 1 + len(latest)
         return fused(self.rig.yaw_sigma_rad, self.disparity_offset(yaws, n_nodes, self.nodes[-_VIEWED_NODES:]))
 
     def disparity_offset(
-        self, offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int, viewed: Sequence[Keyframe] | None = None
+        self, offsets: Array, n_nodes: int, viewed: Sequence[Keyframe] | None = None
     ) -> DisparityOffset | None:
-        """Returns the mean offset of links (`calibration_errors`); `viewed` are the nodes of the views, None: all."""
-        if not offsets:
+        """Returns the mean of offsets (n, 2) of links (`calibration_errors`) with the nodes `viewed`, None: all."""
+        if not len(offsets):
             return None
         n_views = self._mean_views(self.nodes if viewed is None else viewed)
         return calibration_errors.disparity_offset(offsets, n_nodes, n_views, self.rig.focal_px)
 
     def distortion(self) -> DistortionError | None:
         """Returns the mean error of k1 by all links; None without one."""
-        found, n_nodes = self.history.distortions, len(self.nodes) - 1
-        if not found or n_nodes < 1:
+        found, n_nodes = self.history.distortions.array, len(self.nodes) - 1
+        if not len(found) or n_nodes < 1:
             return None
         return DistortionError(*calibration_errors.weighted_mean(found, n_nodes, self._mean_views(self.nodes)))
 
@@ -268,7 +270,7 @@ class KeyframeNetwork:
         """Returns the offset of all disparities by the links; None where they are corrected for the yaw instead."""
         if self.rig.yaw_sigma_rad:
             return None
-        return self.disparity_offset(self.history.disparity_offsets, len(self.nodes) - 1)
+        return self.disparity_offset(self.history.disparity_offsets.array, len(self.nodes) - 1)
 
     def _row_pattern(self) -> float:
         """Returns the RMS of the systematic row difference so far [focal lengths]; 0 if it is not noticeable."""
@@ -288,7 +290,7 @@ class KeyframeNetwork:
         everyone = [k for k in self.nodes if k.number in fixed] + nodes
         anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: self.reference_cov}
         start_s = time.perf_counter()
-        yaw = self.disparity_offset(self.history.yaws, len(self.nodes) - 1) if self.rig.yaw_sigma_rad else None
+        yaw = self.disparity_offset(self.history.yaws.array, len(self.nodes) - 1) if self.rig.yaw_sigma_rad else None
         measured = MeasuredErrors(yaw, self._row_pattern())
         try:
             aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, measured)

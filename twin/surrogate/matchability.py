@@ -153,7 +153,7 @@ class FloorImages:
 
 
 def _mean_colour(albedo: Image) -> Image:
-    return np.broadcast_to(albedo.mean(axis=(0, 1)).round().astype(np.uint8), albedo.shape).copy()
+    return np.broadcast_to(np.round(cv2.mean(albedo)[:3]).astype(np.uint8), albedo.shape).copy()
 
 
 class Matchability:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -384,5 +383,6 @@ def _squared_norms(residuals: Array, information: Array) -> Array:
 
 def _sum_by_index(n: int, index: Indices, values: Array) -> Array:
     """Returns the sums (n, ...) of the values (m, ...) that have the same index, for the indices 0 to n - 1."""
-    selection = sparse.csr_array((np.ones(len(index)), (index, np.arange(len(index)))), shape=(n, len(index)))
-    return (selection @ values.reshape(len(index), int(np.prod(values.shape[1:])))).reshape(n, *values.shape[1:])
+    sums = np.zeros((n, *values.shape[1:]))
+    np.add.at(sums, index, values)
+    return sums

@@ -232,7 +232,8 @@ def _grid(size_px: tuple[int, int], border: tuple[int, int] = (0, 0)) -> Array:
 def _missing_px(positions: Array, rig: StereoRig) -> NDArray[np.int64]:
     """Returns the border (columns, rows) [px] that spline interpolation at `positions` [px] needs on each side."""
     last = np.array([rig.width_px - 1, rig.height_px - 1])
-    missing = np.maximum(-positions.min(axis=(0, 1)), positions.max(axis=(0, 1)) - last)
+    least, most = np.array([(part.min(), part.max()) for part in np.moveaxis(positions, -1, 0)]).T
+    missing = np.maximum(-least, most - last)
     return np.maximum(np.ceil(missing + resample.REACH_PX), 0).astype(np.int64)
 
 
