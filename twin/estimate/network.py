@@ -1,7 +1,7 @@
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -244,27 +244,26 @@ class KeyframeNetwork:
         pending = [attempt.yaw for _, chain, _ in self._pending for attempt in chain if attempt.yaw is not None]
         others = np.reshape([yaw[:2] for yaw in (*pending, *latest)], (-1, 2))
         yaws, n_nodes = np.concatenate([self.history.yaws.array, others]), len(self.nodes) - 1 + len(latest)
-        return fused(self.rig.yaw_sigma_rad, self.disparity_offset(yaws, n_nodes, self.nodes[-_VIEWED_NODES:]))
+        return fused(self.rig.yaw_sigma_rad, self.disparity_offset(yaws, n_nodes, _VIEWED_NODES))
 
-    def disparity_offset(
-        self, offsets: Array, n_nodes: int, viewed: Sequence[Keyframe] | None = None
-    ) -> DisparityOffset | None:
-        """Returns the mean of offsets (n, 2) of links (`calibration_errors`) with the nodes `viewed`, None: all."""
+    def disparity_offset(self, offsets: Array, n_nodes: int, n_viewed: int | None = None) -> DisparityOffset | None:
+        """Returns the mean of the offsets (n, 2) of links, with the views of the latest `n_viewed` nodes or of all."""
         if not len(offsets):
             return None
-        n_views = self._mean_views(self.nodes if viewed is None else viewed)
-        return calibration_errors.disparity_offset(offsets, n_nodes, n_views, self.rig.focal_px)
+        return calibration_errors.disparity_offset(offsets, n_nodes, self._mean_views(n_viewed), self.rig.focal_px)
 
     def distortion(self) -> DistortionError | None:
         """Returns the mean error of k1 by all links; None without one."""
         found, n_nodes = self.history.distortions.array, len(self.nodes) - 1
         if not len(found) or n_nodes < 1:
             return None
-        return DistortionError(*calibration_errors.weighted_mean(found, n_nodes, self._mean_views(self.nodes)))
+        return DistortionError(*calibration_errors.weighted_mean(found, n_nodes, self._mean_views()))
 
-    def _mean_views(self, nodes: Sequence[Keyframe]) -> float:
-        poses, depth_m = (np.array([getattr(n, key) for n in nodes]) for key in ("world_from_camera", "depth_m"))
-        return calibration_errors.mean_views(poses, depth_m, self.rig)
+    def _mean_views(self, n_latest: int | None = None) -> float:
+        n = len(self.nodes)
+        first = 0 if n_latest is None else max(n - n_latest, 0)
+        depth_m = np.array([node.depth_m for node in self.nodes[first:]])
+        return calibration_errors.mean_views(self._node_poses[first:n], depth_m, self.rig)
 
     def offset_by_motions(self) -> DisparityOffset | None:
         """Returns the offset of all disparities by the links; None where they are corrected for the yaw instead."""
