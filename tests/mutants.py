@@ -104,7 +104,7 @@ MUTANTS = [
         ("twin/imaging/scene/object_view.py", "vertices[:, 2] -= deflection**2 / (2 * height_m)", "vertices[:, 2] -= deflection**2 / height_m", "imaging_sway"),
         ("twin/imaging/reference/directions.py", "low, high = (k / cells) ** 4, ((k + 1) / cells) ** 4", "low, high = (k / cells) ** 2, ((k + 1) / cells) ** 2", "imaging_reference imaging_photons"),
         # estimators
-        ("twin/estimate/vision/motion_filter.py", "velocity * (interval_s**2 / 3), shared", "velocity * interval_s**2, shared", "estimate_motion_filter"),
+        ("twin/estimate/vision/motion_filter.py", "[[interval_s**2 / 3, interval_s / 2]", "[[interval_s**2, interval_s / 2]", "estimate_motion_filter"),
         ("twin/estimate/vision/stereo.py", "return measured, joint / rig.focal_px**2", "return measured, joint / rig.focal_px", "estimate_motion estimate_link_noise"),
         ("twin/estimate/vision/stereo.py", "(self.accumulated_cov - earlier.accumulated_cov)", "(self.accumulated_cov + earlier.accumulated_cov)", "estimate_wide_search"),
         ("twin/estimate/vision/epipolar.py", "matrix @ translation / focal_baseline", "matrix @ translation * focal_baseline", "estimate_disparity estimate_depth_filter estimate_motion"),

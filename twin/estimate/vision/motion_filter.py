@@ -72,4 +72,4 @@ def _acceleration_cov(interval_s: float) -> Array:
     """Returns the covariance (12, 12) of pose and velocity that white-noise acceleration adds within an interval."""
     # a constant one (Bar-Shalom et al. 2001, section 6.3.2) would reverse the velocity error at each frame
     velocity = np.diag((_ACCELERATION * interval_s) ** 2)
-    return np.kron([[interval_s**2 / 3, interval_s / 2], [interval_s / 2, 1.0]], velocity)
+    return np.asarray(np.kron([[interval_s**2 / 3, interval_s / 2], [interval_s / 2, 1.0]], velocity), np.float64)

@@ -144,10 +144,12 @@ def _adjust_pair(
     measured: PairMeasurements, baseline_m: float, guess: Array, settings: PairMotionSettings
 ) -> Motion | None:
     """Returns the motion of `pair_motion`, which is not finite if the Gauss-Newton iteration diverges."""
-    locking = settings.locking or _NO_LOCKING
-    arrays = (np.ascontiguousarray(values, np.float64) for values in (*measured, *locking, guess))
-    a_from_b, amplitude_px, structure, normals = _iterate(*arrays, baseline_m, settings.n_measured)
-    normals = _WeightedNormals(*normals)
+    measured = PairMeasurements(*map(np.ascontiguousarray, measured))
+    locking = PixelLocking(*map(np.ascontiguousarray, settings.locking or _NO_LOCKING))
+    a_from_b, amplitude_px, structure, found = _iterate(
+        measured, locking, guess.copy(), baseline_m, settings.n_measured
+    )
+    normals = _WeightedNormals(*found)
     if abs(amplitude_px) > MAX_LOCKING_PX:
         return _adjust_pair(measured, baseline_m, guess, settings._replace(locking=None))
     if np.count_nonzero(normals.weight) < _MIN_POINTS:
@@ -176,34 +178,34 @@ class _WeightedNormals(NamedTuple):
 
 
 @kernel
-def _iterate(a, b, cov_a, cov_b, locking_a, locking_b, guess, baseline_m, n_measured):
+def _iterate(measured, locking, guess, baseline_m, n_measured):
     """Returns motion, amplitude of locking [px], structure, and `_WeightedNormals` before the last step."""
-    measured, a_from_b, amplitude_px, structure = PairMeasurements(a, b, cov_a, cov_b), guess, 0.0, b
+    a_from_b, amplitude_px, structure = guess, 0.0, measured.b
     for _ in range(_ITERATIONS):
         observations = linearise(measured, structure, a_from_b, baseline_m)
-        if len(locking_a):
-            observations = _with_locking(observations, locking_a, locking_b, amplitude_px)
+        if len(locking.a):
+            observations = _with_locking(observations, locking, amplitude_px)
         normals = _weighted_normals(observations, amplitude_px, n_measured)
         update = np.linalg.solve(normals.normal, normals.right)
         structure = adjust_structure(observations, measured, update)
-        a_from_b = geometry.compose(a_from_b, geometry.exp(update[:6]))
+        a_from_b = geometry.compose(a_from_b, geometry.exp(update[:6]))  # pyright: ignore[reportArgumentType]
         amplitude_px += np.sum(update[6:])
         if np.sum(update * (normals.normal @ update)) < (_CONVERGED * normals.scale) ** 2:
             break
-    return a_from_b, amplitude_px, structure, normals
+    return a_from_b, amplitude_px, structure, normals  # pyright: ignore[reportPossiblyUnboundVariable]
 
 
 @kernel
-def _with_locking(observations, locking_a, locking_b, amplitude_px):
+def _with_locking(observations, locking, amplitude_px):
     """Returns the observations with pixel locking as seventh unknown, linearised and reduced at `amplitude_px`."""
-    residual, n = observations.residual, len(locking_a)
+    residual, n = observations.residual, len(locking.a)
     jacobian, size = np.empty((n, 3, 7)), np.empty(n)
     for i in range(n):
         for r in range(3):
             jacobian[i, r, :6] = observations.jacobian_motion[i, r]
-            jacobian[i, r, 6] = locking_a[i, r]  # derivative of the predicted measurements by the amplitude
+            jacobian[i, r, 6] = locking.a[i, r]  # derivative of the predicted measurements by the amplitude
             for c in range(3):
-                jacobian[i, r, 6] -= observations.jacobian_point[i, r, c] * locking_b[i, c]
+                jacobian[i, r, 6] -= observations.jacobian_point[i, r, c] * locking.b[i, c]
             residual[i, r] -= jacobian[i, r, 6] * amplitude_px
         size[i] = np.sqrt(np.sum(residual[i] * (observations.information[i] @ residual[i])) / 3)
     return LinearisedObservations(residual, observations.jacobian_point, jacobian, observations.information, size)
