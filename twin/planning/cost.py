@@ -38,9 +38,9 @@ _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
 _RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=4.2)
 _DISPARITY_MB_PER_MPX = 4.0  # of one keyframe: two numbers of 16 bits a pixel
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
-_RENDERED_MB = _Coefficients(start=813.0, keyframe_mpx=7.0)
+_RENDERED_MB = _Coefficients(start=760.0, keyframe_mpx=7.0)
 _IMAGES_MB_PER_MPX = 300.0
-_SURROGATE_MB = 670.0
+_SURROGATE_MB = 640.0
 #: Memory of the floor [MB] of a rendered survey, per node of the height grid and per texel (see `terrains.terrain`).
 _NODE_MB, _TEXEL_MB = 400e-6, 9e-6
 _WALL_CELL_MB, _WALL_TEXEL_MB = 36e-6, 14e-6  #: memory of walls [MB], per steep cell and per texel of their texture
