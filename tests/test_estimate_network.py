@@ -1,6 +1,7 @@
 """Tests of the keyframe network."""
 
 import time
+from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
@@ -74,6 +75,21 @@ def test_measurements_are_recorded_in_the_order_of_the_nodes_whichever_thread_en
     names = network.history.disparity_offsets.array[:, 0].tolist()
     assert names == network.history.link_residuals == [100 * link.j + link.i for link in network.links]
     assert len(names) > 10 and [name // 100 for name in names] == sorted(name // 100 for name in names)
+
+
+def test_the_yaw_by_many_links_takes_little_longer_than_by_few():
+    """Regression: from lists of all links, made at every keyframe, it took most of the time of a long survey."""
+    network, times_s = connected(Numbered(False), 3), []
+    network.rig = replace(network.rig, yaw_sigma_rad=1e-3)
+    for n in (100, 20000):
+        network.history.yaws.append(np.tile([1e-3, 1e-4], (n, 1)))
+        runs_s = []
+        for _ in range(20):
+            start_s = time.process_time()
+            network.yaw_rad()
+            runs_s.append(time.process_time() - start_s)
+        times_s.append(min(runs_s))
+    assert times_s[1] < 20 * times_s[0]
 
 
 @pytest.mark.parametrize("background", [True, False])
