@@ -17,12 +17,7 @@ from numpy.typing import ArrayLike
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import (
-    CalibrationEstimate,
-    DisparityOffset,
-    EpipolarError,
-    LengthScale,
-)
+from twin.core.quality import CalibrationEstimate, DisparityOffset, EpipolarError, LengthScale
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.link_selection import RECURRENCE
 from twin.estimate.navigation.aiding import unary_factors
