@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.threads import in_row_bands
 from twin.kernels import kernel
 from twin.terrains.noise import cells, fractal_noise, lattice_table, value_noise
 
@@ -60,17 +61,18 @@ def paint(
     structure = np.array([c.structure for c in covers], np.int64)
     numbers = np.array([[c.size_m, c.strength, c.noise] for c in covers])
     ramps = np.ascontiguousarray(ramps.swapaxes(1, 2))
-    return _paint(material, tone, texel_m, ramps, structure, numbers, lattice_table(rng))
+    colour, table = np.empty((*material.shape, 3), np.uint8), lattice_table(rng)
+    arguments = material, tone, texel_m, ramps, structure, numbers, table, colour
+    in_row_bands(lambda first, end: _paint(*arguments, first, end), len(material))
+    return colour
 
 
 @kernel
-def _paint(material, tone, texel_m, ramps, structure, numbers, table):
-    """Returns the colours (rows, cols, 3) with ramps (4, 256, 3), structures (4,), and `numbers` (4, 3) of `Cover`."""
-    rows, cols = material.shape
+def _paint(material, tone, texel_m, ramps, structure, numbers, table, colour, first, end):
+    """Fills rows of `colour` (rows, cols, 3); ramps (4, 256, 3), structures (4,) and `numbers` (4, 3) of `Cover`."""
     alike = [bool(np.all(ramps[k] == ramps[k + 1])) for k in range(3)]
-    colour = np.empty((rows, cols, 3), np.uint8)
-    for r in range(rows):
-        for c in range(cols):
+    for r in range(first, end):
+        for c in range(material.shape[1]):
             noise = (tone[r, c] - 128.0) / 256.0
             x, y = c * texel_m, r * texel_m
             level = material[r, c] / 64.0 - 0.5  # 0, 1, 2, 3: nothing but one of the materials
@@ -80,17 +82,16 @@ def _paint(material, tone, texel_m, ramps, structure, numbers, table):
                 level = min(max(level, float(k)), k + 1.0)
             share = min(max((level - k - 0.35) / 0.3, 0.0), 1.0)
             share = 0.0 if alike[k] else share * share * (3.0 - 2.0 * share)
-            first = 0.5 + numbers[k, 2] * noise
-            second = 0.5 + numbers[k + 1, 2] * noise
+            lower = 0.5 + numbers[k, 2] * noise
+            upper = 0.5 + numbers[k + 1, 2] * noise
             if share < 1.0:
-                first += numbers[k, 1] * _structure(structure[k], x, y, numbers[k, 0], table)
+                lower += numbers[k, 1] * _structure(structure[k], x, y, numbers[k, 0], table)
             if share > 0.0:
-                second += numbers[k + 1, 1] * _structure(structure[k + 1], x, y, numbers[k + 1, 0], table)
-            one = ramps[k, int(min(max(first, 0.0), 1.0) * 255.0)]
-            two = ramps[k + 1, int(min(max(second, 0.0), 1.0) * 255.0)]
+                upper += numbers[k + 1, 1] * _structure(structure[k + 1], x, y, numbers[k + 1, 0], table)
+            one = ramps[k, int(min(max(lower, 0.0), 1.0) * 255.0)]
+            two = ramps[k + 1, int(min(max(upper, 0.0), 1.0) * 255.0)]
             for band in range(3):
                 colour[r, c, band] = np.uint8((1.0 - share) * one[band] + share * two[band] + 0.5)
-    return colour
 
 
 @kernel

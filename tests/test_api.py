@@ -55,6 +55,7 @@ def test_a_changed_copy_of_a_scenario_is_validated():
         scenario.plan.model_copy(update={"altitude_m": -1.0})
 
 
+@pytest.mark.long
 def test_a_survey_returns_its_arrays_and_a_second_one_gets_its_own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first, second = (twin.run("reef", plan=SMALL, imaging=FAST, seed=seed) for seed in (1, 2))

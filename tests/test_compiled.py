@@ -6,6 +6,7 @@ import pkgutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from numba.core.registry import CPUDispatcher
 
@@ -52,12 +53,39 @@ def test_fastmath_functions_that_others_call_are_inlined():
     assert not wrong, f"called by others, so forceinline=True is required: {', '.join(wrong)}"
 
 
-@pytest.mark.long
-def test_a_run_that_compiles_and_one_that_loads_the_cache_write_identical_files(tmp_path):
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "MUJOCO_GL": "egl"}
-    small = ["--set", "plan.tracks=1", "--set", "plan.area_m=[2.4, 1.2]"]
+IMAGES = """
+import sys
+import numpy as np
+from twin.app.look import render_view
+from twin.scenario.file import load_scenario
+from twin.world.mission import prepare
+view = render_view(prepare(load_scenario("reef")), twist_body=np.array([0.0, 0.0, 0.1, 0.2, 0.0, 0.0]))
+layers = [*view.stereo_pair[:4], *view.decomposed.components, view.decomposed.raw]
+np.savez(sys.argv[1], *[layer for layer in layers if layer is not None])
+"""
+
+
+def in_both_ways(folder, *arguments):
+    """Runs Python twice with an empty cache of kernels in `folder`, with "compiles" and "reads" as last argument."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "MUJOCO_GL": "egl"}
     for name in ("compiles", "reads"):
-        line = [sys.executable, "-m", "twin", "run", "reef", *small, "--out", str(tmp_path / name)]
+        line = [sys.executable, *arguments, str(folder / name)]
         subprocess.run(line, env=environment, check=True, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.long
+def test_images_of_compiled_and_of_loaded_code_are_identical(tmp_path):
+    in_both_ways(tmp_path, "-c", IMAGES)
+    compiled, read = (np.load(tmp_path / f"{name}.npz") for name in ("compiles", "reads"))
+    assert len(compiled.files) > 8
+    for name in compiled.files:
+        np.testing.assert_array_equal(compiled[name], read[name])
+
+
+@pytest.mark.slow
+def test_a_run_that_compiles_and_one_that_loads_the_cache_write_identical_files(tmp_path):
+    in_both_ways(
+        tmp_path, "-m", "twin", "run", "reef", "--set", "plan.tracks=1", "--set", "plan.area_m=[2.4, 1.2]", "--out"
+    )
     for file in ("trajectory_truth.tum", "trajectory_f2f.tum", "trajectory_final.tum", "dem.tif"):
         assert (tmp_path / "compiles" / file).read_bytes() == (tmp_path / "reads" / file).read_bytes(), file

@@ -156,6 +156,7 @@ def test_the_small_grid_reaches_the_optimum_of_gtsam(public_graph):
     assert solved_from(chordal_poses(links), links).cost == pytest.approx(517.93, rel=1e-4)
 
 
+@pytest.mark.long
 def test_the_sphere_reaches_the_optimum_of_gtsam_and_the_truth(public_graph):
     links = public_graph("sphere2500.txt")
     graph = gtsam_graph(links)

@@ -100,7 +100,7 @@ def plainly_drawn(item: DrawnMesh, projection: Projection, target: Target) -> No
 def test_an_image_is_that_of_all_triangles_one_by_one(name: str, projection: Projection) -> None:
     """To the last bit, over a floor that hides a part of the mesh, whether or not back faces are drawn."""
     mesh = MESHES[name]
-    mesh = mesh._replace(faces=mesh.faces[:: 1 + len(mesh.faces) // 5000])
+    mesh = mesh._replace(faces=mesh.faces[:: 1 + len(mesh.faces) // 2000])
     shows = 0
     for k, view in enumerate(random_views(4)):
         item = DrawnMesh(mesh, view, 7, k % 2 == 0, parts_of(mesh))

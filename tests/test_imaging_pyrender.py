@@ -90,6 +90,7 @@ def test_depth_agrees_with_pyrender(poses: np.ndarray, tmp_path: Path) -> None:
     assert len(error_m) > 0.5 * ours.size and np.median(error_m) < 1e-5 and np.percentile(error_m, 98) < 1e-4
 
 
+@pytest.mark.long
 def test_depth_of_objects_agrees_with_pyrender(poses: np.ndarray, tmp_path: Path, monkeypatch) -> None:
     """Within 1 mm at 99.9 % of the pixels; the others are silhouettes, as OpenGL rounds vertices to 1/256 pixel."""
     monkeypatch.setattr(object_view, "LEVEL_PX", 0.0)  # the full meshes

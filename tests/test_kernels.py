@@ -71,6 +71,7 @@ def replace(file: Path, old, new):
     os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
+@pytest.mark.long
 def test_an_edit_of_a_called_function_or_of_a_constant_in_another_file_is_seen(package):
     assert run(package) == (5.0, 0)
     assert run(package) == (5.0, 1)

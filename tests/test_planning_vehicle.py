@@ -55,6 +55,7 @@ def test_flown_at_full_thrust_the_vehicle_reaches_its_top_speed(model):
     assert body.twist_body[3] == pytest.approx(top_speed_mps(section, ahead), rel=0.01)
 
 
+@pytest.mark.long
 def test_the_limits_of_a_survey_follow_its_plan_and_its_current():
     still = twin.vehicle("reef")
     lateral = twin.vehicle("reef", overrides=["current.velocity_mps=[0,0.3,0]"])

@@ -58,6 +58,7 @@ def test_other_curves_are_anchored_at_the_first_true_pose(run, alignment):
         np.testing.assert_allclose(one.errors("final").distance_m, expected.distance_m, atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_page_states_the_alignment_of_the_curves(run):
     assert context(run)["alignment"] == "anchored at the first true pose"
     replayed = replace(run, metrics=run.metrics | {"replay": {"alignment": "none"}})

@@ -50,6 +50,7 @@ def test_eight_thrusters_control_all_six_degrees_of_freedom_and_six_all_but_pitc
 
 
 @pytest.mark.parametrize("name", sorted({*VEHICLE.built_in()} - {"auv"}))  # it needs more room: test_world_auv.py
+@pytest.mark.long
 def test_every_vehicle_follows_a_plan(tmp_path, name):
     overrides = [*SMALL, f"vehicle.model={name}"]
     metrics = survey.run(load_scenario("reef", overrides), tmp_path / name).metrics

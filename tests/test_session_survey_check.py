@@ -193,6 +193,7 @@ def test_the_chi_square_of_links_is_that_of_their_own_covariances():
     assert _mean_chi2(links, np.array([2.0, 4.0])) == pytest.approx(3 * 3.0 / 6)
 
 
+@pytest.mark.long
 def test_the_threads_that_store_images_end_with_the_estimators(tmp_path, monkeypatch):
     closed = []
     monkeypatch.setattr(StereoVision, "close", lambda self: closed.append(self))

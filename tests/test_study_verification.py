@@ -65,7 +65,7 @@ objectives = ["timing.simulated_s"]
 trials = 4
 batch = 4
 confirm = 2
-plans = 2
+plans = 1
 rounds = 0
 keep = "report"
 

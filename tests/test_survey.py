@@ -73,6 +73,7 @@ def test_the_resolved_scenario_flies_the_same_survey(flown):
     assert again.fingerprint() == flown.metrics["scenario_hash"]
 
 
+@pytest.mark.long
 def test_one_seed_gives_byte_identical_trajectories_and_map(flown, tmp_path):
     again = fly(tmp_path / "again")
     for name in [*(f"trajectory_{t}.tum" for t in TRAJECTORIES), "dem.tif", "dem_sigma.tif"]:

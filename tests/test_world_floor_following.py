@@ -133,6 +133,7 @@ def test_without_a_chart_the_path_is_level_above_the_floor_at_its_start():
 
 
 @pytest.mark.parametrize(("height", "largest_m"), [("map", 0.1), ("altimeter", 0.22)])
+@pytest.mark.long
 def test_a_vehicle_follows_a_floor_that_nobody_knew(height, largest_m, tmp_path):
     rough = ["terrain.relief_m=4.0", "plan.area_m=[8.0,3.0]", "plan.tracks=1"]
     given = [*rough, "terrain.prior=none", "plan.height=floor"]

@@ -46,6 +46,7 @@ def test_a_gap_that_stays_is_not_flown_over_for_ever():
     assert filler.gaps.left_m2 == filler.gaps.found_m2 and "could not be covered" in filler.gaps.sentence
 
 
+@pytest.mark.long
 def test_a_survey_without_gaps_flies_no_further_track(tmp_path):
     whole = survey.run(scenario(), tmp_path / "whole", outputs=None).metrics
     plain = survey.run(scenario("plan.fill_gaps=false"), tmp_path / "plain", outputs=None).metrics
@@ -65,6 +66,7 @@ def test_a_task_that_cannot_be_flown_is_refused(task, line):
         prepare(scenario(f"tasks=[{{{task}}}]"))
 
 
+@pytest.mark.long
 def test_tasks_have_their_own_maps_in_the_order_of_flight(tmp_path):
     later, first = 'name="b",position_m=[0.5,0.3],altitude_m=1.0', 'name="a",position_m=[-0.5,0.0],altitude_m=1.0'
     tasks = "tasks=[{" + later + "},{" + first + ",after_track=1}]"

@@ -57,15 +57,19 @@ def _fill_from(source, positions, out, first, end):
 def _round_row(row, out):
     """Rounds values (3 w,) to 0 to 255, and adds the remainder of each to the next pixel of its band."""
     # Without them, small shifts of an image with little contrast would be lost: they change integers by less than 1/2.
+    red = green = blue = np.float32(0.0)
+    for k in range(0, row.size, 3):  # the bands together, as each pixel waits for the remainder of the last one
+        out[k], red = _rounded(row[k] + red)
+        out[k + 1], green = _rounded(row[k + 1] + green)
+        out[k + 2], blue = _rounded(row[k + 2] + blue)
+
+
+@kernel(forceinline=True)
+def _rounded(value):
     half, least, most = np.float32(0.5), np.float32(0.0), np.float32(255.0)
-    for band in range(3):
-        remainder = np.float32(0.0)
-        for k in range(band, row.size, 3):
-            value = row[k] + remainder
-            rounded = np.floor(min(max(value, least), most) + half)
-            remainder = min(max(value - rounded, -half), half)
-            remainder = remainder if abs(remainder) > EXACT else np.float32(0.0)
-            out[k] = np.uint8(rounded)
+    rounded = np.floor(min(max(value, least), most) + half)
+    remainder = min(max(value - rounded, -half), half)
+    return np.uint8(rounded), remainder if abs(remainder) > EXACT else np.float32(0.0)
 
 
 @kernel

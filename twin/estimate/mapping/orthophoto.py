@@ -55,13 +55,9 @@ def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, 
 
 
 def add_view(
-    layers: OrthoLayers,
-    rgb: Map,
-    saturated: Image,
-    world_from_camera: Array,
-    rig: StereoRig,
+    layers: OrthoLayers, rgb: Map, saturated: Image, world_from_camera: Array, rig: StereoRig,
     heights_m: tuple[float, float],
-) -> None:
+) -> None:  # fmt: skip
     """Adds an image (H, W, 3) at a pose (4, 4) in map axes; `saturated` (H, W) is 1 where a colour is not reliable."""
     grid = layers.grid
     bounds = _pixels_within(footprint(world_from_camera, rig, heights_m), grid)

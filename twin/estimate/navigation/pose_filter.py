@@ -66,14 +66,9 @@ def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
 
 @kernel
 def dead_reckon(
-    last: DeadReckoningState,
-    aiding: FrameAiding,
-    a_from_b: Array,
-    cov: Array,
-    height_m: float,
-    rpy_rad: Array,
+    last: DeadReckoningState, aiding: FrameAiding, a_from_b: Array, cov: Array, height_m: float, rpy_rad: Array,
     velocity_mps: Array,
-) -> tuple[DeadReckoningState, Array]:
+) -> tuple[DeadReckoningState, Array]:  # fmt: skip
     """Advances by a frame with a visual motion and readings; also returns the motion (4, 4) fused with the DVL."""
     # if the DVL has readings at some frames only, that is its mean per frame since the last one
     update = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps, aiding.gates)

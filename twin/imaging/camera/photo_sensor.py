@@ -75,7 +75,7 @@ class PhotoSensor:
 
     def levels(self, light: Radiance, setting: ExposureSetting) -> NDArray[np.float32]:
         """Returns the noise-free image (H, W, 3) of a radiance image [grey levels, not rounded]."""
-        signal = light * (self._vignetting[..., None] * np.array(self.signal_per_cd(setting)))
+        signal = light * (self._vignetting[..., None] * np.array(self.signal_per_cd(setting), np.float32))
         signal = np.minimum(np.minimum(signal, 1.0) * self._flat[..., None], 1.0)
         levels = 255 * tone(signal, self._sensor.tone_curve)
         return np.asarray(levels, np.float32)

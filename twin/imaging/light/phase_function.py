@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
+from twin.kernels import kernel
 
 CELLS = 4096  # number of cells of a table
 _GAUSS = np.polynomial.legendre.leggauss(6)
@@ -119,12 +120,20 @@ def table_of(scatterer: Scatterer) -> PhaseTable:
 
 def phase_at(scatterers: tuple[Scatterer, ...], cosine: Array) -> Array:
     """Returns the phase function (..., n) [1/sr] of n scatterers at cosines (...), by interpolation of the tables."""
-    table = _densities(scatterers)
-    at = np.sqrt(np.sqrt(np.maximum((1 - cosine) / 2, 0.0))) * CELLS - 0.5
-    at = np.clip(at, 0.0, CELLS - 1.001)
-    cell = at.astype(np.intp)
-    low = table[cell]
-    return low + (at - cell)[..., None] * (table[cell + 1] - low)
+    found = _interpolated(_densities(scatterers), np.ravel(cosine))
+    return found.reshape(*cosine.shape, found.shape[1])
+
+
+@kernel
+def _interpolated(table, cosine):
+    found = np.empty((cosine.size, table.shape[1]))
+    for i in range(cosine.size):
+        at = np.sqrt(np.sqrt(max((1 - cosine[i]) / 2, 0.0))) * CELLS - 0.5
+        at = min(max(at, 0.0), CELLS - 1.001)
+        cell = int(at)
+        for k in range(table.shape[1]):
+            found[i, k] = table[cell, k] + (at - cell) * (table[cell + 1, k] - table[cell, k])
+    return found
 
 
 @lru_cache(maxsize=64)

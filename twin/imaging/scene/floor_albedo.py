@@ -38,13 +38,9 @@ def floor_surface(terrain: Terrain) -> FloorSurface:
 
 
 def paint_floor(
-    surface: FloorSurface,
-    depth: NDArray[np.float32],
-    albedo: Image,
-    world_from_camera: Array,
-    focal_px: float,
+    surface: FloorSurface, depth: NDArray[np.float32], albedo: Image, world_from_camera: Array, focal_px: float,
     rows: slice,
-) -> None:
+) -> None:  # fmt: skip
     """Paints rows of the image (H, W, 3) of a centred pinhole camera, and replaces 1 / depth [1/m] by depth [m]."""
     pose = np.array(world_from_camera[:3])
     pose[:, 3] -= surface.corner_m
