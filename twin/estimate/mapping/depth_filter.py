@@ -7,6 +7,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Map, Mask, StereoRig
+from twin.core.threads import in_row_bands
 from twin.estimate.vision import epipolar
 from twin.estimate.vision.disparity import Disparity
 from twin.kernels import kernel
@@ -54,7 +55,9 @@ def propagate(
     guess = new.depth_m.copy()
     _forward_project(old.depth_m, np.ascontiguousarray(new_from_old), guess, camera)
     old_from_new, focal_baseline = geometry.inverse(new_from_old), rig.focal_px * rig.baseline_m
-    prior = _backward_warp(*old, guess, old_from_new, step_cov, camera, focal_baseline, JUMP_PX)
+    prior = DepthMap(*np.full((2, *guess.shape), np.nan, np.float32))
+    warped = *old, guess, old_from_new, step_cov, camera, focal_baseline, JUMP_PX, *prior
+    in_row_bands(lambda first, end: _backward_warp(*warped, first, end), len(guess))
     fused = DepthMap(new.depth_m.copy(), new.variance_m2.copy())
     return fused, _fuse(*fused, *prior, GATE)
 
@@ -165,14 +168,14 @@ def _normal(depth, u, v, camera, focal_baseline, jump):
 
 
 @kernel
-def _backward_warp(old, old_variance, guess, pose, step_cov, camera, focal_baseline, jump):
-    """Returns depth and variance (H, W) of the old map in the new image, linearised at `guess` (H, W); NaN: none."""
-    height, width = old.shape
+def _backward_warp(
+    old, old_variance, guess, pose, step_cov, camera, focal_baseline, jump, depth, variance, first, end
+):  # fmt: skip
+    """Fills rows of depth and variance (H, W) of the old map in the new image, linearised at `guess` (H, W)."""
     focal, cx, cy = camera
-    depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))
     is_uncertain = np.trace(step_cov) > 0
-    for v in range(height):
-        for u in range(width):
+    for v in range(first, end):
+        for u in range(old.shape[1]):
             z = guess[v, u]
             if not z > 0:
                 continue
@@ -194,7 +197,6 @@ def _backward_warp(old, old_variance, guess, pose, step_cov, camera, focal_basel
             if is_uncertain:
                 px, py = (u - cx) / focal * z, (v - cy) / focal * z
                 variance[v, u] += z * z * variance_along(px, py, z, nx, ny, nz, step_cov)
-    return depth, variance
 
 
 @kernel(inline="always")

@@ -13,6 +13,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.interpolation import catmull_rom_weights
 from twin.core.records import Array, Image, Map, MapGrid, StereoRig
+from twin.core.threads import in_row_bands
 from twin.kernels import kernel
 
 #: K of the weight. Between two cameras 0.15 heights apart, the seam (10 % to 90 % of the weight) is 0.06 heights wide:
@@ -75,7 +76,8 @@ def add_view(
     )
     nearest = np.full(saturated.shape, np.inf, np.float32)
     _mark_nearest(layers.height_m, *bounds, *view, nearest)
-    _blend(*layers[1:], *bounds, *view, rgb, saturated, nearest)
+    top, blended = bounds[0], (*bounds[2:], *view, rgb, saturated, nearest)
+    in_row_bands(lambda first, end: _blend(*layers[1:], top + first, top + end, *blended), bounds[1] - top)
 
 
 def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
