@@ -11,10 +11,11 @@ _SKIPPED_WITHOUT = "needs outside data"
 #: Modules that take longest, in the order in which they start: before the short modules, so that the workers end at the
 #: same time; the first use different compiled functions, so that workers rarely compile a function at the same time.
 LONGEST = (
-    "test_survey", "test_imports", "test_surrogate", "test_imaging_daylight", "test_hostile_input",
+    "test_survey", "test_world_auv", "test_export_command", "test_simulate_sea", "test_study_verification",
+    "test_checkpoint", "test_imports", "test_surrogate", "test_imaging_daylight", "test_hostile_input",
     "test_world_mission_patterns", "test_plugin_skeleton", "test_datasets_replay", "test_look", "test_plugin_flight",
     "test_orthomosaic", "test_gym", "test_imaging_materials", "test_session_stepped_world", "test_reproduce_turbidity",
-    "test_terrains_objects", "test_report_mesh_picture", "test_export_command", "test_report_survey_page",
+    "test_terrains_objects", "test_report_mesh_picture", "test_report_survey_page",
 )  # fmt: skip
 
 
