@@ -130,7 +130,7 @@ def _interpolated(table, cosine):
     for i in range(cosine.size):
         at = np.sqrt(np.sqrt(max((1 - cosine[i]) / 2, 0.0))) * CELLS - 0.5
         at = min(max(at, 0.0), CELLS - 1.001)
-        cell = int(at)
+        cell = int(max(0.0, at))  # also of NaN, which gives NaN
         for k in range(table.shape[1]):
             found[i, k] = table[cell, k] + (at - cell) * (table[cell + 1, k] - table[cell, k])
     return found
