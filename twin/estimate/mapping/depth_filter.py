@@ -55,9 +55,11 @@ def propagate(
     guess = new.depth_m.copy()
     _forward_project(old.depth_m, np.ascontiguousarray(new_from_old), guess, camera)
     old_from_new, focal_baseline = geometry.inverse(new_from_old), rig.focal_px * rig.baseline_m
-    prior = DepthMap(*np.full((2, *guess.shape), np.nan, np.float32))
-    warped = *old, guess, old_from_new, step_cov, camera, focal_baseline, JUMP_PX, *prior
-    in_row_bands(lambda first, end: _backward_warp(*warped, first, end), len(guess))
+    prior = DepthMap(np.full_like(guess, np.nan), np.full_like(guess, np.nan))
+    lens = camera, focal_baseline, JUMP_PX
+    in_row_bands(
+        lambda first, end: _backward_warp(*old, guess, old_from_new, step_cov, *lens, *prior, first, end), len(guess)
+    )
     fused = DepthMap(new.depth_m.copy(), new.variance_m2.copy())
     return fused, _fuse(*fused, *prior, GATE)
 
