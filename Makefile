@@ -3,6 +3,8 @@ BIN := .venv/bin
 READY := .venv/ready
 PARALLEL := -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
+unexport PYTHONDONTWRITEBYTECODE # without bytecode, every process of a test compiles all modules anew
+
 .PHONY: env demo test fast long slow bench docs agreement
 
 env: $(READY) ## set up: a virtual environment with exact versions

@@ -26,6 +26,12 @@ def tree_of(path):
     return ast.parse(path.read_text())
 
 
+@functools.cache
+def nodes_of(path):
+    """Returns all nodes of the syntax tree of a module."""
+    return tuple(ast.walk(tree_of(path)))
+
+
 def dotted(path):
     parts = path.relative_to(ROOT).with_suffix("").parts
     if parts[0] != "twin":  # twin/terrains, twin/scenes and twin/controllers are links to these folders
@@ -59,9 +65,9 @@ def room_of(module):
     return max(found, key=len, default=None)
 
 
-def imports(tree, module=""):
+def imports(nodes, module=""):
     """Yields the modules that a module imports, anywhere in it; `from a import b` is a.b where that is a module."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -83,7 +89,7 @@ def is_forbidden(module, imported):
 def arrows():
     """Returns the imports between modules of the project: {module: {imported}}."""
     return {
-        module: {name for name in imports(tree_of(path), module) if name in NAMES and name != module}
+        module: {name for name in imports(nodes_of(path), module) if name in NAMES and name != module}
         for path, module in ((path, dotted(path)) for path in modules())
     }
 
@@ -120,7 +126,7 @@ def circle(graph):
 def test_every_import_is_in_the_table(path):
     module = dotted(path)
     assert room_of(module) is not None, f"{module} is in no room of docs/architecture.md"
-    wrong = [name for name in imports(tree_of(path), module) if is_forbidden(module, name)]
+    wrong = [name for name in imports(nodes_of(path), module) if is_forbidden(module, name)]
     assert not wrong, f"{module} may not import {', '.join(wrong)}"
 
 
@@ -146,7 +152,7 @@ def test_every_import_is_in_the_table(path):
     ],
 )
 def test_an_import_that_the_table_does_not_allow_is_found(module, line):
-    assert any(is_forbidden(module, name) for name in imports(ast.parse(line)))
+    assert any(is_forbidden(module, name) for name in imports(ast.walk(ast.parse(line))))
 
 
 def test_every_module_finds_the_names_that_it_imports():
@@ -181,7 +187,7 @@ def test_the_diagram_is_that_of_the_imports():
 
 def test_estimators_do_not_use_the_truth():
     for path in (ROOT / "twin" / "estimate").rglob("*.py"):
-        names = {node.id for node in ast.walk(tree_of(path)) if isinstance(node, ast.Name)}
+        names = {node.id for node in nodes_of(path) if isinstance(node, ast.Name)}
         assert not names & {"Truth", "Mission", "World"}, f"{dotted(path)} uses the truth"
 
 
@@ -219,7 +225,7 @@ assert not os.environ.keys() & {set(SETTINGS)}
 
 
 def test_rerun_is_imported_by_one_module():
-    importers = {dotted(path) for path in modules() if any(within(name, "rerun") for name in imports(tree_of(path)))}
+    importers = {dotted(path) for path in modules() if any(within(name, "rerun") for name in imports(nodes_of(path)))}
     assert importers == {"twin.report.recording"}
 
 
@@ -235,7 +241,7 @@ def test_no_function_outside_compiled_kernels_has_more_than_seven_parameters():
     wide = [
         f"{dotted(path)}.{node.name}"
         for path in modules()
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.FunctionDef)
         and len(parameters(node)) > 7
         and not any(name in ast.unparse(decorator) for decorator in node.decorator_list for name in exempt)

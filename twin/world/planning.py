@@ -250,8 +250,8 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     level = _non_overlap(make(whole._replace(surface=None, leg_spacing=_EQUAL)), pattern, _level_floor(request), rig)
     allowed = np.maximum(level, [1 - request.overlap_along, 1 - request.overlap_across])
     plan, scale, unchanged = make(whole), np.ones(2), np.zeros(2)
+    found = _non_overlap(plan, pattern, field, rig)
     for _ in range(_ITERATIONS):
-        found = _non_overlap(plan, pattern, field, rig)
         short = found > allowed * (1 + _TOLERANCE)
         if not short.any():
             return whole._replace(tracks=request.tracks, cross_lines=request.cross_lines)
@@ -263,6 +263,7 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
         previous, plan = plan, make(whole)
         same = np.equal(_spacing(plan), _spacing(previous))
         unchanged = np.where(same, unchanged + 1, 0)
+        found = found if same.all() else _non_overlap(plan, pattern, field, rig)
     raise TwinError(
         "plan.altitude_m",
         f"{request.altitude_m:g}: no spacing keeps the required overlap over the floor, which comes too near",
