@@ -80,20 +80,14 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     if request.cross_lines:
         paths.append(_cross_track(request, area, legs[: 2 * n_tracks], corners[-1][-1], paths[-1][-1].yaw))
     return SurveyPlan(
-        request,
-        paths=tuple(paths),
-        area=area,
-        speed_mps=request.speed_mps,
+        request, paths=tuple(paths), area=area, speed_mps=request.speed_mps,
         n_frames_per_keyframe=frames_per_keyframe(request, request.speed_mps),
         swath_length_m=float(np.mean([leg.end_m - leg.start_m for leg in legs])),
-        swath_spacing_m=max(s.spacing_m for s in strips),
-        n_tracks_to_fill=sum(counts),
-        side_along_m=request.footprint_m[1],
-        side_across_m=request.footprint_m[0],
-        least_spacing_m=min(s.spacing_m for s in strips),
-        legs_after_gaps=tuple(2 * n for n in accumulate(counts[:-1])),
+        swath_spacing_m=max(s.spacing_m for s in strips), n_tracks_to_fill=sum(counts),
+        side_along_m=request.footprint_m[1], side_across_m=request.footprint_m[0],
+        least_spacing_m=min(s.spacing_m for s in strips), legs_after_gaps=tuple(2 * n for n in accumulate(counts[:-1])),
         covered_to_m=math.inf if n_tracks == sum(counts) else strips[2 * n_tracks - 1].high_m,
-    )
+    )  # fmt: skip
 
 
 def _in_spacings(low_m: float, high_m: float, request: SurveyRequest) -> float:

@@ -38,16 +38,10 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     return SurveyPlan(
         request,
         paths=tuple((_loop(request, area, loop_diameter_m, 2 * math.pi * k / n_filling),) for k in range(n_tracks)),
-        area=area,
-        speed_mps=speed_mps,
-        n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
-        swath_length_m=math.pi * loop_diameter_m,
-        swath_spacing_m=spacing_m,
-        n_tracks_to_fill=n_filling,
-        side_along_m=shorter_m,
-        side_across_m=shorter_m,
-        least_spacing_m=spacing_m,
-    )
+        area=area, speed_mps=speed_mps, n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
+        swath_length_m=math.pi * loop_diameter_m, swath_spacing_m=spacing_m, n_tracks_to_fill=n_filling,
+        side_along_m=shorter_m, side_across_m=shorter_m, least_spacing_m=spacing_m,
+    )  # fmt: skip
 
 
 def _loop(request: SurveyRequest, area: SurveyArea, diameter_m: float, angle: float) -> Circle:

@@ -88,7 +88,7 @@ def differences(expected, found):
 
 def leftovers(folder):
     """Returns what only a run in progress has."""
-    names = (".lock", ".reserve", "checkpoint", "*.part", ".*.part")
+    names = (".lock", ".reserve", "checkpoint", "*.part", ".*.part", "*_disparity.npy")
     return [str(file.relative_to(folder)) for name in names for file in folder.rglob(name)]
 
 

@@ -18,9 +18,12 @@ from twin.core.checkpoint import FOLDER, Checkpoints
 from twin.core.interrupts import StageGuard
 from twin.core.series import GrowingArray
 from twin.errors import TwinError
+from twin.estimate.vision.disparity import Disparity
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.tiles import TiledRaster
-from twin.scenario.file import input_files, load_scenario
+from twin.report.run_writer import RunFolder
+from twin.scenario.file import dump_toml, input_files, load_scenario
+from twin.session.assembly import checkpoints_of
 from twin.session.conclusion import Estimation
 from twin.studies.results_log import cut_torn_line
 from twin.world.mission_flight import Flight
@@ -268,14 +271,73 @@ def test_a_survey_killed_while_it_maps_or_reports_goes_on_after_the_flight(tmp_p
     assert flown and not any(flown)
 
 
-def test_a_finished_survey_of_another_scenario_is_not_resumed(tmp_path, monkeypatch):
-    class Finished:
-        metrics = {"scenario_hash": "0"}
+@pytest.fixture
+def finished(tmp_path, monkeypatch):
+    """The folder of a run that was killed after it had written its metrics, but before its last files were removed."""
+    files = {
+        "metrics.json": "{}",
+        "scenario.resolved.toml": dump_toml(load_scenario("reef", ["record=all"])),
+        "checkpoint/manifest.json": "{}",
+        "keyframes/000001_left.png": "",
+        "keyframes/000001_disparity.npy": "",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(survey.RunResult, "of_folder", lambda _: survey.RunResult("complete", {}, tmp_path))
+    return tmp_path
 
-    monkeypatch.setattr(survey.RunResult, "of_folder", lambda _: Finished)
-    (tmp_path / "metrics.json").write_text("{}")
-    with pytest.raises(TwinError, match="has another survey, which is finished"):
-        survey.run(load_scenario("reef"), Path(tmp_path), resume=True)
+
+@pytest.mark.parametrize("other", [["record=none"], ["record=keyframes"], ["record=all", "seed=2"]])
+def test_a_finished_run_of_another_scenario_is_not_resumed_and_keeps_its_files(finished, other):
+    before = sorted(finished.rglob("*"))
+    with pytest.raises(TwinError, match="has another run, which is finished"):
+        survey.run(load_scenario("reef", other), finished, resume=True)
+    assert sorted(finished.rglob("*")) == before
+
+
+def test_a_finished_run_that_is_resumed_loses_what_only_a_run_in_progress_has(finished):
+    assert survey.run(load_scenario("reef", ["record=all"]), finished, resume=True).status == "complete"
+    names = sorted(file.name for file in finished.rglob("*") if file.is_file())
+    assert names == ["000001_left.png", "metrics.json", "scenario.resolved.toml"]
+
+
+@pytest.mark.parametrize("length", [0, 100])
+def test_a_disparity_that_a_full_disk_cut_is_a_read_error(tmp_path, length):
+    spool, image = ImageSpool(tmp_path), np.zeros((8, 8, 3), np.uint8)
+    spool.put(3, image, image, (image[..., 0], image[..., 0]), Disparity(*np.ones((2, 8, 8), np.float32)))
+    file = tmp_path / "000003_disparity.npy"
+    spool.disparity(3)
+    file.write_bytes(file.read_bytes()[:length])
+    with pytest.raises(OSError, match="000003_disparity.npy cannot be read"):
+        spool.disparity(3)
+
+
+def test_a_start_that_is_refused_for_lack_of_space_leaves_no_files(tmp_path, monkeypatch):
+    def write_bytes(file, data):
+        raise OSError(28, "No space left on device", str(file))
+
+    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    Checkpoints(tmp_path / "run", {}, (), 1.0).open(False)
+    with pytest.raises(TwinError, match="a writable folder with space"):
+        RunFolder(tmp_path / "run", load_scenario("reef"))
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_a_changed_file_of_a_plug_in_is_an_input_that_has_changed(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "myctl").mkdir()
+    for name, text in {"__init__": "", "gains": "GAIN = 1.0", "control": "class Controller: pass"}.items():
+        (tmp_path / "myctl" / f"{name}.py").write_text(text)
+    scenario = load_scenario("reef", ["control.plugin=myctl.control:Controller"], allow_plugins=True)
+    (tmp_path / "run").mkdir()
+    checkpoints = checkpoints_of(scenario, tmp_path / "run", 1e-9)
+    checkpoints.open(False)
+    checkpoints.save_if_due("state")
+    assert checkpoints_of(scenario, tmp_path / "run", 1e-9).open(True) == "state"
+    (tmp_path / "myctl" / "gains.py").write_text("GAIN = 2.0")
+    with pytest.raises(TwinError, match=r"the file \S*gains.py has changed"):
+        checkpoints_of(scenario, tmp_path / "run", 1e-9).open(True)
 
 
 def test_a_study_refuses_an_input_file_that_has_changed_and_takes_new_ones(tmp_path):

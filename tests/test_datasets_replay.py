@@ -51,6 +51,33 @@ def replayed(euroc, tmp_path_factory):
     return twin.replay(euroc, tmp_path_factory.mktemp("run"), ReplayOptions(outputs=()))
 
 
+def test_a_finished_replay_is_resumed_with_the_same_data_and_options_only(replayed, euroc, tmp_path):
+    files = {file: file.read_bytes() for file in replayed.folder.rglob("*") if file.is_file()}
+    options = ReplayOptions(outputs=())
+    again = twin.replay(euroc, replayed.folder, options, resume=True)
+    assert (again.metrics, again.result) == (json.loads(json.dumps(replayed.metrics)), None)
+    shutil.copytree(euroc, tmp_path / "other")
+    for dataset, other in ((euroc, replace(options, frames=slice(0, 8))), (tmp_path / "other", options)):
+        with pytest.raises(TwinError, match="has another run, which is finished"):
+            twin.replay(dataset, replayed.folder, other, resume=True)
+    with pytest.raises(TwinError, match="does not exist"):
+        twin.replay(tmp_path / "none", replayed.folder, options, resume=True)
+    assert {file: file.read_bytes() for file in replayed.folder.rglob("*") if file.is_file()} == files
+
+
+def test_results_in_the_folder_of_the_data_are_no_inputs_of_a_replay(euroc, tmp_path, monkeypatch):
+    dataset = tmp_path / "dataset"
+    shutil.copytree(euroc, dataset)
+    monkeypatch.setattr(replay, "Checkpoints", lambda out, identity, inputs, interval_s: list(inputs))
+    options = ReplayOptions(outputs=())
+    before = replay._checkpoints(open_dataset(dataset, options), options, "", dataset / "runs" / "1", None)
+    for name in ("runs/0/env.json", "runs/0/trajectory.txt", "runs/1/scenario.resolved.toml"):
+        (dataset / name).parent.mkdir(parents=True, exist_ok=True)
+        (dataset / name).touch()
+    after = replay._checkpoints(open_dataset(dataset, options), options, "", dataset / "runs" / "1", None)
+    assert before and after == before
+
+
 def test_the_replayed_path_and_map_are_accurate(replayed):
     assert replayed.metrics["timing"]["frames"] == N
     assert replayed.metrics["trajectory"]["final"]["ate_max_m"] < 0.003

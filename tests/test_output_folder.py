@@ -107,7 +107,7 @@ def test_python_refuses_a_used_folder_as_the_command_line_does(tmp_path, write):
     assert os.listdir(tmp_path) == ["old.png"]
 
 
-ROW = '{"sample": 0, "seed": 1, "status": "complete", "scenario_hash": ""}\n'
+ROW = '{"sample": 0, "seed": 1, "status": "complete", "scenario_hash": "", "reason": ""}\n'
 STUDY = {"rows.jsonl": ROW, "runs/00000_s1/metrics.json": ""}
 SEARCH = STUDY | {"optuna.journal": ""}
 RUN = {"log.jsonl": "", "metrics.json": ""}

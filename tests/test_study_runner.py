@@ -88,6 +88,19 @@ def test_unfinished_run_folders_are_removed_on_resume(study, tmp_path):
     (unfinished / "log.jsonl").write_text("cut o")
     run_study(study, tmp_path / "out", resume=True)
     assert not unfinished.exists()
+    with runner.open_folder(tmp_path / "out", resume=True):
+        unfinished.mkdir()  # of a survey that exceeds its time
+    assert not unfinished.exists()
+
+
+@pytest.mark.parametrize("line", ['{"sample": 0}', '{"sample": [], "seed": 1}', '{"sample": 0, "seed": 1', "[0]"])
+def test_a_damaged_row_counts_as_none(study, tmp_path, line):
+    run_study(study, tmp_path / "out")
+    table = rows(tmp_path / "out")
+    with (tmp_path / "out" / "rows.jsonl").open("a") as file:
+        file.write(line + "\n")
+    run_study(study, tmp_path / "out", resume=True)
+    assert rows(tmp_path / "out").equals(table)
 
 
 @pytest.mark.parametrize(
@@ -127,14 +140,14 @@ def test_a_survey_with_an_incomplete_row_is_flown_again(study, table, tmp_path):
 
 
 def test_rows_stay_in_memory_while_the_disk_is_full(tmp_path):
-    log = ResultsLog(tmp_path)
-    log.add({"sample": 0, "seed": 1, "status": "complete"})
+    log, row = ResultsLog(tmp_path), {"seed": 1, "scenario_hash": "1a", "status": "complete", "reason": ""}
+    log.add({"sample": 0} | row)
     file, log.file = log.file, type(tmp_path)("/dev/full")
-    log.add({"sample": 1, "seed": 1, "status": "complete"})
+    log.add({"sample": 1} | row)
     with pytest.raises(OSError, match="No space left"):
         log.flush()
     log.file = file
-    log.add({"sample": 2, "seed": 1, "status": "complete"})
+    log.add({"sample": 2} | row)
     assert [row["sample"] for row in log.rows()] == [0, 1, 2]
 
 

@@ -132,6 +132,7 @@ def test_a_search_killed_while_it_chooses_a_batch_ends_with_the_same_candidates(
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(optuna.Study, "ask", ask_until_killed)
         search(study, tmp_path / "out")
+    (tmp_path / "out" / "optuna.journal.lock").symlink_to("optuna.journal of a folder that was moved")
     assert search(study, tmp_path / "out", resume=True).candidates == whole.candidates
 
 

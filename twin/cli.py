@@ -20,7 +20,6 @@ import typer
 from twin import api
 from twin.app import console, outputs
 from twin.app.termination import INTERRUPTED, sigterm_as_interrupt
-from twin.core.checkpoint import remove_if_finished
 from twin.core.output_folder import sole_writer
 from twin.errors import TwinError
 
@@ -476,8 +475,6 @@ def replay(
         return
     folder = out or Path("runs") / f"{name}-replay"
     folder = outputs.new_folder(folder, used=resume) if out or resume else outputs.unused_folder(folder)
-    if resume and remove_if_finished(folder):
-        _conclude(api.load_run(folder), as_json)
     with console.replay_bar() as progress:
         result = recorded.replay(dataset, folder, options, progress, resume, checkpoint_s)
     _conclude(result, as_json)

@@ -12,11 +12,12 @@ from twin.core.quality import Gaps
 from twin.core.records import Estimate, Frame
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
-from twin.core.user_files import is_file
-from twin.errors import SurveyAborted, TwinError
+from twin.errors import SurveyAborted
+from twin.estimate.vision.image_spool import remove_disparities
 from twin.report.frame_recorder import FrameRecorder, Record, remove_keyframe_images
 from twin.report.run_result import RunResult
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
+from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
 from twin.session.assembly import Estimators, checkpoints_of, closing, make_navigator, open_world
 from twin.session.conclusion import Estimation, conclude
@@ -79,13 +80,11 @@ def run(
     """
     with sole_writer(out, used=resume), one_blas_thread():
         checkpoints = checkpoints_of(scenario, out, checkpoint_s)
-        if resume and is_file(out / "metrics.json"):  # killed after its end
-            result = RunResult.of_folder(out)
-            if result.metrics["scenario_hash"] != scenario.fingerprint():
-                raise TwinError("--resume", f"{out} has another survey, which is finished", "the folder of this survey")
-        else:
+        result = RunResult.of_finished(out, dump_toml(scenario)) if resume else None
+        if result is None:
             result = _run(prepare(scenario), out, progress, live, outputs, checkpoints, resume)
         checkpoints.remove()
+        remove_disparities(out / "keyframes")  # which a checkpoint needs until now
         if scenario.record == "none" and outputs is not None:
             remove_keyframe_images(out)
     return result

@@ -39,7 +39,7 @@ class Checkpoints:
             raise TwinError("checkpoint_s", f"{interval_s} s is no time between checkpoints", "0 or more")
         self._run, self._folder, self._manifest = run, run / FOLDER, run / FOLDER / "manifest.json"
         self._contents: dict[str, Any] = {"schema": SCHEMA, "identity": dict(identity), "state": None}
-        self._inputs, self._made_anew = sorted(set(inputs)), ()
+        self._inputs, self._made_anew = inputs, ()
         self._is_default, self._interval_s = interval_s is None, DEFAULT_S if interval_s is None else interval_s
         self._start_s = self._last_s = time.perf_counter()
         self.problem = ""  #: why the last state could not be saved
@@ -54,7 +54,7 @@ class Checkpoints:
         self._made_anew = made_anew
         if not (resume or self._interval_s):
             return None
-        self._contents["inputs"] = {str(file): file_hash(file) for file in self._inputs}
+        self._contents["inputs"] = {str(file): file_hash(file) for file in sorted(set(self._inputs))}
         if resume and is_file(self._manifest):
             state = self._checked_state()
             if state is not None:
@@ -73,7 +73,8 @@ class Checkpoints:
         for part, what in (("identity", "{}: was {}, is {}"), ("inputs", "the file {} has changed")):
             before, now = found.get(part), self._contents[part]
             if not isinstance(before, dict) or before.keys() != now.keys():
-                raise TwinError(name, f"has other {part}", _SAME)
+                other = min(before.keys() ^ now.keys()) if isinstance(before, dict) else before
+                raise TwinError(name, f"has other {part}: {other}", _SAME)
             for key in now:
                 if before[key] != now[key]:
                     raise TwinError(name, what.format(key, before[key], now[key]), _SAME)
@@ -132,13 +133,6 @@ class Checkpoints:
         """Removes the folder; the manifest, without which nothing is resumed, first."""
         self._manifest.unlink(missing_ok=True)
         shutil.rmtree(self._folder, ignore_errors=True)
-
-
-def remove_if_finished(run: Path) -> bool:
-    """Returns whether a run has ended, and then removes the checkpoints that it leaves if it is killed at its end."""
-    if is_file(run / "metrics.json"):
-        shutil.rmtree(run / FOLDER, ignore_errors=True)
-    return is_file(run / "metrics.json")
 
 
 def file_hash(file: Path) -> str:

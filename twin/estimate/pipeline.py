@@ -399,29 +399,20 @@ class Navigator:
         failed, counts = np.isnan(residuals), self.filter.gates.counts
         across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
         return EstimationQuality(
-            frames_lost=self.log.n_lost,
-            repeats=self.log.repeats,
-            nodes_bridged=history.nodes_bridged,
-            links_tried=len(residuals),
-            links_failed=int(failed.sum()),
+            frames_lost=self.log.n_lost, repeats=self.log.repeats, nodes_bridged=history.nodes_bridged,
+            links_tried=len(residuals), links_failed=int(failed.sum()),
             link_residual=None if failed.all() else float(np.median(residuals[~failed])),
             link_chi2=alignments[-1].link_chi2 if alignments else None,
-            alignment_converged=not alignments or alignments[-1].converged,
-            epipolar=self.vision.epipolar_error(),
+            alignment_converged=not alignments or alignments[-1].converged, epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
-            disparity_offset=self.network.offset_by_motions(),
-            distortion=self.network.distortion(),
-            calibration=history.calibration,
-            independent_errors=history.independent_errors,
+            disparity_offset=self.network.offset_by_motions(), distortion=self.network.distortion(),
+            calibration=history.calibration, independent_errors=history.independent_errors,
             altimeter_m={n.row: n.readings.altitude_m for n in nodes if n.readings.altitude_m is not None},
-            lasting_residuals=lasting_residuals(nodes, self.rig, self.network.noise),
-            length_scale=across,
-            depth_scale=along,
-            readings_rejected=dict(zip(SENSORS, counts[:, 1].tolist(), strict=True)),
-            readings_disputed=dict(zip(SENSORS, counts[:, 2].tolist(), strict=True)),
-            reading_notes=self._watch.notes,
+            lasting_residuals=lasting_residuals(nodes, self.rig, self.network.noise), length_scale=across,
+            depth_scale=along, readings_rejected=dict(zip(SENSORS, counts[:, 1].tolist(), strict=True)),
+            readings_disputed=dict(zip(SENSORS, counts[:, 2].tolist(), strict=True)), reading_notes=self._watch.notes,
             readings_believed=dict(zip(SENSORS, counts[:, 3].tolist(), strict=True)),
-        )
+        )  # fmt: skip
 
     def build_map(
         self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None,

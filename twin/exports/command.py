@@ -146,24 +146,16 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
     if georeference is None and dem.is_file():
         georeference = geotiff.read_georeference(dem)
     return RunContents(
-        folder=folder,
-        name=str(run.scenario.get("name", folder.name)),
-        scenario=run.scenario,
-        rig=rig,
-        true=None if scenario is None else true_calibration(scenario),
-        trajectories=run.trajectories,
-        frames=frames,
-        imu=None if scenario is None else recorded_imu(folder, scenario),
-        elevation=elevation,
+        folder=folder, name=str(run.scenario.get("name", folder.name)), scenario=run.scenario, rig=rig,
+        true=None if scenario is None else true_calibration(scenario), trajectories=run.trajectories, frames=frames,
+        imu=None if scenario is None else recorded_imu(folder, scenario), elevation=elevation,
         error_m=_layer(run, "dem_error", elevation),
         true_map=folder / "dem_truth.tif" if "dem_truth" in run.rasters else None,
-        orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
-        georeference=georeference,
+        orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None, georeference=georeference,
         jpeg_quality=options.jpeg_quality,
         notes=() if scenario is None else tuple(missing_files(run, scenario, frames)),
-        renders_again=rendered and (folder / "frames" / "truth.npz").is_file(),
-        allow_plugins=options.allow_plugins,
-    )
+        renders_again=rendered and (folder / "frames" / "truth.npz").is_file(), allow_plugins=options.allow_plugins,
+    )  # fmt: skip
 
 
 def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:

@@ -1,10 +1,12 @@
 """Loading of plug-ins: classes of other packages, named `module:Class` or registered as entry points."""
 
 import importlib
+import sys
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, TypeVar
 
 from twin.errors import TwinError, described, did_you_mean
@@ -35,6 +37,17 @@ def load(key: str, group: str, name: str) -> Callable[..., Any]:
         problem = f"{name}: no installed package registers this name in {group}{did_you_mean(name, entries)}"
         raise TwinError(key, problem, ", ".join(["module:Class", *sorted(entries)]))
     return attempt(key, name, entries[name].load)
+
+
+def source_files(key: str, group: str, name: str | None) -> list[Path]:
+    """Returns all files of the package of a plug-in; none without `name`. Raises TwinError if it cannot be loaded."""
+    if name is None:
+        return []
+    module = load(key, group, name).__module__
+    files = [getattr(sys.modules.get(one), "__file__", None) for one in (module.partition(".")[0], module)]
+    file = Path(next(filter(None, files)) or "")
+    found = file.parent.rglob("*") if file.name == "__init__.py" else [file]
+    return [one for one in found if one.is_file() and "__pycache__" not in one.parts]
 
 
 def attempt(key: str, name: str, function: Callable[[], T]) -> T:

@@ -25,15 +25,17 @@ from twin.errors import SurveyAborted, TwinError
 from twin.estimate import Navigator
 from twin.estimate.self_check import check_survey
 from twin.estimate.stereo_vision import StereoVision
+from twin.estimate.vision.image_spool import remove_disparities
 from twin.judge.metrics import EvaluationInput
 from twin.judge.recorded import ALIGNMENTS, AlignmentName, RecordedTruth, associate, true_from_world, true_heights
 from twin.plugin.guard import check_loadable
-from twin.plugin.loading import ESTIMATORS
+from twin.plugin.loading import ESTIMATORS, source_files
 from twin.plugin.navigator import NOTE, Estimators, navigator_of
 from twin.plugin.protocols import EstimatorSetup
 from twin.recordings.opened_dataset import OpenedDataset, ReplayOptions, open_dataset
 from twin.recordings.recorded_aiding import Start
 from twin.report.replay_description import describe_replay
+from twin.report.run_result import RunResult
 from twin.report.run_writer import RunFolder, SurveyRecord
 from twin.session.assembly import closing, program
 from twin.session.conclusion import Estimation, Maps, conclude
@@ -57,7 +59,7 @@ class ReplayResult(NamedTuple):
     status: str  #: "complete", "degraded" or "aborted"
     metrics: dict[str, Any]  #: contents of metrics.json
     folder: Path  #: the run folder
-    result: SurveyResult  #: result of the estimators
+    result: SurveyResult | None  #: result of the estimators; None if a finished replay was to be resumed
     elevation: ElevationMap | None  #: the map; None if none was built
 
 
@@ -100,8 +102,11 @@ def _replay(
     opened = open_dataset(folder, options)
     settings = replace(options.settings or EstimatorSettings(), window_tracks=_ALL_TRACKS, wide_search=True)
     setup, start = _setup(opened, options, settings)
-    description = describe_replay(opened.name, _source(opened), setup.rig, settings, options.estimator)
+    source = _source(opened) | {"identity": _identity(opened, options)}
+    description = describe_replay(opened.name, source, setup.rig, settings, options.estimator)
     checkpoints = _checkpoints(opened, options, description.text, out, checkpoint_s)
+    if resume and (ended := RunResult.of_finished(out, description.text)):
+        return _closed(checkpoints, ReplayResult(ended.status, ended.metrics, out, None, None))
     found: _Estimated | None = checkpoints.open(resume)
     with guard, ExitStack() as resources:
         if found is None:
@@ -119,20 +124,32 @@ def _replay(
         guard.cause = found.cause
         estimation = Estimation(found.navigator, found.stopwatch, guard, found.folder, progress, start_s)
         run, survey = conclude(estimation, _Replayed(opened, options, guard))
+    return _closed(checkpoints, ReplayResult(run.status, run.metrics, out, survey.result, survey.elevation))
+
+
+def _closed(checkpoints: Checkpoints, result: ReplayResult) -> ReplayResult:
     checkpoints.remove()
-    return ReplayResult(run.status, run.metrics, out, survey.result, survey.elevation)
+    remove_disparities(result.folder / "keyframes")  # which a checkpoint needs until now
+    return result
+
+
+def _identity(opened: OpenedDataset, options: ReplayOptions) -> str:
+    """Returns a hash of the options of a replay and of the names and times of its images."""
+    frames = [(images.time_s, images.left.name, images.right and images.right.name) for images in opened.dataset.images]
+    return sha256(repr((replace(options, settings=None), frames)).encode()).hexdigest()[:16]
 
 
 def _checkpoints(
     opened: OpenedDataset, options: ReplayOptions, description: str, out: Path, interval_s: float | None
 ) -> Checkpoints:
-    """Returns the checkpoints of a replay of this data set, files, options and program (of images, names and times)."""
-    frames = [(images.time_s, images.left.name, images.right and images.right.name) for images in opened.dataset.images]
-    named = repr((description, replace(options, settings=None), frames)).encode()
+    """Returns the checkpoints of a replay, which belong to its description, its files and this program."""
     folder, given = opened.dataset.folder, (options.calibration, options.truth, options.true_map)
     beside = [folder] if folder.is_file() else [file for file in folder.rglob("*") if file.suffix in _COMPARED]
-    files = [file for file in (*beside, *filter(None, given)) if is_file(file)]
-    return Checkpoints(out, {"replay": sha256(named).hexdigest()[:16]} | program(), files, interval_s)
+    runs = {out.resolve(), *(file.resolve().parent for file in folder.rglob("env.json"))}  # results in the data set
+    used = (file for file in (*beside, *filter(None, given)) if runs.isdisjoint(file.resolve().parents))
+    files = [file for file in used if is_file(file)]
+    files += source_files(ESTIMATOR_OPTION, ESTIMATORS, options.estimator)
+    return Checkpoints(out, {"replay": sha256(description.encode()).hexdigest()[:16]} | program(), files, interval_s)
 
 
 def _estimate_in_stage(
@@ -216,15 +233,12 @@ class _Replayed:
         frames, times_s = self.opened.frames, result.online.times_s
         source = _source(self.opened) | {"skipped": dict(frames.skipped), "frames_in_dataset": len(frames)}
         return EvaluationInput(
-            result,
-            maps.elevation,
+            result, maps.elevation,
             self.guard.attempt("evaluation", lambda: self._truth(result, maps.elevation)) or self._truth(result, None),
-            frames.rectification.rig,
-            timing={"simulated_s": float(times_s[-1] - times_s[0]) if len(times_s) else 0.0},
-            identity={"name": self.opened.name},
-            warnings=self._notes(result),
+            frames.rectification.rig, timing={"simulated_s": float(times_s[-1] - times_s[0]) if len(times_s) else 0.0},
+            identity={"name": self.opened.name}, warnings=self._notes(result),
             source=source | ({"tiles": maps.n_tiles} if maps.n_tiles else {}),
-        )
+        )  # fmt: skip
 
     def _truth(self, result: SurveyResult, elevation: ElevationMap | None) -> RecordedTruth:
         path, true_map, alignment = self.opened.truth, self.opened.true_map, self.options.alignment

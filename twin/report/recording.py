@@ -245,7 +245,7 @@ def log_curves(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
 
 def _thrusts_n(file: Path) -> Array:
     """Returns the true thrust (frames, n) of each thruster [N]; empty if it was not recorded."""
-    with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(file) as arrays:
+    with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), np.load(file) as arrays:
         return arrays["thrust_n"]
     return np.zeros((0, 0))
 

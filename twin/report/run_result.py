@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core.optional_packages import optional
 from twin.core.records import Trajectory
+from twin.core.user_files import is_file
 from twin.errors import TwinError
 from twin.judge.verdict import numbers_of
 
@@ -44,6 +45,19 @@ class RunResult:
             raise TwinError(str(folder), "has no metrics.json: the survey has not finished", "a finished run")
         result = cls(run.metrics["status"], run.metrics, run.folder)
         vars(result)["contents"] = run
+        return result
+
+    @classmethod
+    def of_finished(cls, folder: Path, description: str) -> "RunResult | None":
+        """Returns the outcome of a run that was killed after its end; None if it has not ended.
+
+        Raises TwinError if the finished run is another one: its scenario.resolved.toml is not `description`.
+        """
+        if not is_file(folder / "metrics.json"):
+            return None
+        result, file = cls.of_folder(folder), folder / "scenario.resolved.toml"
+        if not is_file(file) or file.read_text(encoding="utf-8") != description:
+            raise TwinError("--resume", f"{folder} has another run, which is finished", "the folder of the same run")
         return result
 
     @cached_property

@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shutil
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_info
 
 from twin.core import geometry
+from twin.core.checkpoint import FOLDER as CHECKPOINTS
 from twin.core.checkpoint import flushed_length, reopened
 from twin.core.georeference import Georeference
 from twin.core.interrupts import StageGuard
@@ -98,6 +100,9 @@ class RunFolder:
             self._write("env.json", json.dumps(environment(), indent=1))
             self._reserve.write_bytes(bytes(_RESERVE_BYTES))
         except OSError as error:
+            shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
+            for name in (self._reserve.name, _LOG, "scenario.resolved.toml", "env.json"):
+                (folder / name).unlink(missing_ok=True)
             raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder with space") from None
         self.log("started", time_s=0.0, name=scenario.name, seed=scenario.seed)
 

@@ -1,6 +1,6 @@
 """Assembly of a survey: world, visual measurements and estimators, as the scenario specifies them."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
@@ -11,6 +11,7 @@ from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision_interface import Vision
 from twin.kernels import source_hash
+from twin.plugin.loading import CONTROLLERS, ESTIMATORS, TERRAINS, source_files
 from twin.plugin.navigator import Estimators, navigator_of
 from twin.plugin.protocols import EstimatorSetup
 from twin.report.run_writer import environment
@@ -25,7 +26,14 @@ _OF_THE_MACHINE = ("machine", "system", "cpus")  # of env.json: other machines m
 def checkpoints_of(scenario: Scenario, out: Path, interval_s: float | None) -> Checkpoints:
     """Returns the checkpoints of a survey, which belong to its scenario, its input files and this program."""
     identity = {"scenario": scenario.fingerprint(), "record": scenario.record} | program()
-    return Checkpoints(out, identity, input_files(scenario), interval_s)
+    return Checkpoints(out, identity, _files_of(scenario), interval_s)
+
+
+def _files_of(scenario: Scenario) -> Iterator[Path]:
+    """Yields the input files of a scenario and the files of its plug-ins; these are loaded only when it is read."""
+    yield from input_files(scenario)
+    for section, group in (("terrain", TERRAINS), ("control", CONTROLLERS), ("estimate", ESTIMATORS)):
+        yield from source_files(f"{section}.plugin", group, getattr(scenario, section).plugin)
 
 
 @cache

@@ -16,7 +16,6 @@ from twin.core.records import ElevationMap, MapGrid, SurveyResult
 from twin.core.timing import Stopwatch, timing_summary
 from twin.errors import SurveyAborted
 from twin.estimate.self_check import with_length_error
-from twin.estimate.vision.image_spool import remove_disparities
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.report.run_result import RunResult
 from twin.report.run_writer import RunFolder, SurveyRecord
@@ -102,7 +101,6 @@ def conclude(estimation: Estimation, run: RunKind) -> tuple[RunResult, Evaluatio
     progress("report", 0.0)
     record = run.record(survey, SurveyRecord(result, maps.elevation, None, None, stopwatch, metrics))
     metrics = folder.finish(record, guard)
-    remove_disparities(folder.path / "keyframes")  # which a checkpoint needs until now
     return RunResult(metrics["status"], metrics, folder.path), survey
 
 

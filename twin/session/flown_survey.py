@@ -84,23 +84,14 @@ class FlownSurvey:
             *filter(None, [actions.sentence, self.gaps.sentence]),
         ]  # fmt: skip
         return EvaluationInput(
-            result,
-            maps.elevation,
-            self.truth,
-            mission.rig,
+            result, maps.elevation, self.truth, mission.rig,
             plan=plan | {"along_median": along, "across_median": across},
             timing={"simulated_s": len(result.online) / mission.rig.frame_rate_hz},
             identity={"name": scenario.name, "seed": scenario.seed, "scenario_hash": scenario.fingerprint()},
-            require=scenario.require,
-            warnings=warnings,
-            idealisations=idealisations(scenario),
-            water=mission.clarity._asdict(),
-            stated_input=mission.stated_input,
-            actions=actions,
-            gaps=self.gaps,
-            energy=flown_energy(mission, self.truth.trajectory),
-            tasks=self._tasks(result, maps),
-        )
+            require=scenario.require, warnings=warnings, idealisations=idealisations(scenario),
+            water=mission.clarity._asdict(), stated_input=mission.stated_input, actions=actions, gaps=self.gaps,
+            energy=flown_energy(mission, self.truth.trajectory), tasks=self._tasks(result, maps),
+        )  # fmt: skip
 
     def _tasks(self, result: SurveyResult, maps: Maps) -> list[SurveyedTask]:
         if self.detail_truth is None:

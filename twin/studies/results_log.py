@@ -16,6 +16,7 @@ from twin.studies.flight import Row
 
 JOURNAL_FILE = "optuna.journal"  #: in the folder of a search, beside the log: its candidates
 _IDENTITY = ("sample", "seed", "status", "reason", "unmodelled", "warning", "fidelity", "scenario_hash")
+_KEYS = {"sample": int, "seed": int, "scenario_hash": str, "status": str, "reason": str}  # without them: a damaged row
 _CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionaries would take gigabytes
 
 
@@ -47,7 +48,7 @@ class ResultsLog:
         self._unwritten.clear()
 
     def rows(self) -> Iterator[Row]:
-        """Yields all rows of the file in the order in which they were written; skips partly written rows."""
+        """Yields all rows of the file in the order in which they were written; skips damaged rows."""
         if not self.file.exists():
             return
         with self.file.open("rb") as file:
@@ -56,7 +57,7 @@ class ResultsLog:
                     row = json.loads(line)
                 except ValueError:
                     continue
-                if isinstance(row, dict) and "sample" in row:
+                if isinstance(row, dict) and all(isinstance(row.get(key), kind) for key, kind in _KEYS.items()):
                     yield row
 
     def done(self) -> set[tuple[int, int]]:

@@ -185,9 +185,16 @@ def open_folder(folder: Path, resume: bool, search: bool = False) -> Iterator[Re
             (folder / "runs").mkdir(exist_ok=True)
         except OSError as error:
             raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder") from None
-        for leftover in (folder / "runs").glob(".*"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        yield log
+        _remove_unfinished(folder / "runs")
+        try:
+            yield log
+        finally:
+            _remove_unfinished(folder / "runs")
+
+
+def _remove_unfinished(runs: Path) -> None:
+    for unfinished in runs.glob(".*"):
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def check_results(log: ResultsLog, planned: Mapping[tuple[int, int], str]) -> None:

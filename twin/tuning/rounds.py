@@ -160,21 +160,11 @@ class Tuning:
         plan = recommended or unproven
         scenario = self.trials.scenario(plan.values) if plan else None
         return TuningResult(
-            self.study,
-            self._candidates(),
-            list(self.finalists.values()),
-            list(self.verifications.values()),
-            recommended,
-            unproven,
-            scenario,
-            instructions(prepare(scenario)) if scenario else "",
-            self.start,
-            interrupted,
-            out_of_time,
-            self.needs_rendering,
-            self.confirmation.warnings(self.finalists.values()),
+            self.study, self._candidates(), list(self.finalists.values()), list(self.verifications.values()),
+            recommended, unproven, scenario, instructions(prepare(scenario)) if scenario else "", self.start,
+            interrupted, out_of_time, self.needs_rendering, self.confirmation.warnings(self.finalists.values()),
             self.trials.refusals(self.plans),
-        )
+        )  # fmt: skip
 
     def _fly(self, surveys: CandidateSurveys, plans: dict[int, Values], first: int | None = None) -> None:
         """Flies the `first` surveys of plans (None: all) that have no result."""

@@ -34,6 +34,7 @@ class Search:
     def __init__(self, study: Study, config: TuningConfig, folder: Path, fingerprint: str, search_round: int = 0):
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         cut_torn_line(folder / JOURNAL_FILE)
+        (folder / f"{JOURNAL_FILE}.lock").unlink(missing_ok=True)  # of a process that was killed: the folder is locked
         self.config, self.seed, self.first_number = config, study.sampling.seed, search_round * ROUND_NUMBERS
         further = max(min(config.batch, config.trials), config.trials // 4)  # candidates of a further round
         self.n_trials = further if search_round else config.trials

@@ -94,19 +94,12 @@ def verification_of(
     n_complete = sum(score.status == "complete" for score in scores)
     n_failed = rendered.n_failed(number, values, surveys)
     return Verification(
-        surrogate,
-        required_probability(rendered.study),
-        most,
-        len(scores) + n_failed,
-        sum(score.passed for score in scores),
-        n_failed,
-        medians,
-        PlanRatio(values, ratios, n_complete / len(scores) if scores else 1.0),
-        search_round,
-        rendered.warnings([surrogate]),
-        count_similar(score.reason for score in scores if not score.passed),
+        surrogate, required_probability(rendered.study), most, len(scores) + n_failed,
+        sum(score.passed for score in scores), n_failed, medians,
+        PlanRatio(values, ratios, n_complete / len(scores) if scores else 1.0), search_round,
+        rendered.warnings([surrogate]), count_similar(score.reason for score in scores if not score.passed),
         _causes(scores),
-    )
+    )  # fmt: skip
 
 
 def _causes(scores: list[SurveyScore]) -> dict[str, tuple[float, float]]:

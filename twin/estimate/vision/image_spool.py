@@ -87,7 +87,11 @@ class ImageSpool:
 
     def disparity(self, row: int) -> Disparity:
         self.flush()
-        return Disparity.unpacked(np.load(self._path(row, "disparity", ".npy")))
+        file = self._path(row, "disparity", ".npy")
+        try:
+            return Disparity.unpacked(np.load(file))
+        except (ValueError, EOFError) as error:
+            raise OSError(f"{file} cannot be read: {error}") from None
 
     def gray(self, row: int) -> _Grays:
         """Returns the binned grey levels of both images of the keyframe at frame index `row`, in half precision."""
