@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -385,12 +386,21 @@ def test_an_address_space_in_which_libraries_would_crash_is_one_line():
     assert ended.stderr.strip() == message
 
 
-def test_an_image_that_a_full_disk_lost_costs_the_map_and_not_the_trajectories():
+@pytest.mark.parametrize("lost, map_is_made", [({4}, True), ({2, 4}, False)])
+@pytest.mark.parametrize("chosen", [None, np.array([False, True, True, True, True])])
+def test_an_image_that_a_full_disk_lost_costs_its_part_of_the_map(lost, map_is_made, chosen):
     class Navigator:
-        def build_map(self, *_):
-            raise OSError(28, "No space left on device")
+        def build_map(self, result, grid, report, used):
+            numbers = np.flatnonzero(np.ones(5, bool) if used is None else used)
+            if lost & set(numbers.tolist()):
+                raise OSError(28, "No space left on device")
+            return numbers.tolist()
+
+        def with_tested_sigma(self, result, elevation, used):
+            return elevation
 
     guard = StageGuard()
     estimation = Estimation(Navigator(), None, guard, None, lambda *_: None, 0.0)
-    assert estimation.build_map(None, None) is None
+    found = estimation.build_map(SimpleNamespace(keyframe_rows=np.arange(5)), None, chosen)
+    assert found == ([k for k in range(4) if chosen is None or chosen[k]] if map_is_made else None)
     assert guard.reason == "[Errno 28] No space left on device"

@@ -13,14 +13,13 @@ from twin.core.records import Estimate, Frame
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
-from twin.estimate.vision.image_spool import remove_disparities
 from twin.report.frame_recorder import FrameRecorder, Record, remove_keyframe_images
 from twin.report.run_result import RunResult
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
 from twin.session.assembly import Estimators, checkpoints_of, closing, make_navigator, open_world
-from twin.session.conclusion import Estimation, conclude
+from twin.session.conclusion import Estimation, conclude, remove_state
 from twin.session.flown_survey import FlownSurvey
 from twin.session.mission_actions import MissionActions
 from twin.session.monitor import SurveyMonitor, SurveyProgress
@@ -83,8 +82,7 @@ def run(
         result = RunResult.of_finished(out, dump_toml(scenario)) if resume else None
         if result is None:
             result = _run(prepare(scenario), out, progress, live, outputs, checkpoints, resume)
-        checkpoints.remove()
-        remove_disparities(out / "keyframes")  # which a checkpoint needs until now
+        remove_state(checkpoints, out)
         if scenario.record == "none" and outputs is not None:
             remove_keyframe_images(out)
     return result

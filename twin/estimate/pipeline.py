@@ -378,20 +378,15 @@ class Navigator:
             final = interpolate_between_keyframes(log.steps.array, log.variances.array, rows, self.network.poses)
             final = aligned(final, self._blind_frames, set(rows.tolist()), self.rig, self.network.noise)
         return SurveyResult(
-            f2f=Trajectory(times_s, log.f2f.array),
-            online=Trajectory(times_s, log.online.array),
-            final=Trajectory(times_s, final),
-            keyframe_rows=rows,
+            f2f=Trajectory(times_s, log.f2f.array), online=Trajectory(times_s, log.online.array),
+            final=Trajectory(times_s, final), keyframe_rows=rows,
             track_of_keyframe=np.array([k.track for k in keyframes], dtype=np.int64),
             node_cov=cov if aligned_cov is None else aligned_cov,
-            keyframe_depth_m=np.array([k.depth_m for k in keyframes], dtype=np.float64),
-            links=self.network.links,
-            alignments=history.alignments,
-            before_ga=history.before_ga,
-            after_ga=history.after_ga,
+            keyframe_depth_m=np.array([k.depth_m for k in keyframes], dtype=np.float64), links=self.network.links,
+            alignments=history.alignments, before_ga=history.before_ga, after_ga=history.after_ga,
             stereo_observations=[pair for pair in self.vision.stereo_observations if pair.row < len(log)],
             quality=self._quality(),
-        )
+        )  # fmt: skip
 
     def _quality(self) -> EstimationQuality:
         history, nodes = self.network.history, self.network.nodes

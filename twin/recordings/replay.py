@@ -25,7 +25,6 @@ from twin.errors import SurveyAborted, TwinError
 from twin.estimate import Navigator
 from twin.estimate.self_check import check_survey
 from twin.estimate.stereo_vision import StereoVision
-from twin.estimate.vision.image_spool import remove_disparities
 from twin.judge.metrics import EvaluationInput
 from twin.judge.recorded import ALIGNMENTS, AlignmentName, RecordedTruth, associate, true_from_world, true_heights
 from twin.plugin.guard import check_loadable
@@ -38,7 +37,7 @@ from twin.report.replay_description import describe_replay
 from twin.report.run_result import RunResult
 from twin.report.run_writer import RunFolder, SurveyRecord
 from twin.session.assembly import closing, program
-from twin.session.conclusion import Estimation, Maps, conclude
+from twin.session.conclusion import Estimation, Maps, conclude, remove_state
 
 #: A segment of the path ends, and the network is aligned, when the number of keyframes since the last alignment is this
 #: fraction of all keyframes so far, within limits.
@@ -106,7 +105,8 @@ def _replay(
     description = describe_replay(opened.name, source, setup.rig, settings, options.estimator)
     checkpoints = _checkpoints(opened, options, description.text, out, checkpoint_s)
     if resume and (ended := RunResult.of_finished(out, description.text)):
-        return _closed(checkpoints, ReplayResult(ended.status, ended.metrics, out, None, None))
+        remove_state(checkpoints, out)
+        return ReplayResult(ended.status, ended.metrics, out, None, None)
     found: _Estimated | None = checkpoints.open(resume)
     with guard, ExitStack() as resources:
         if found is None:
@@ -124,13 +124,8 @@ def _replay(
         guard.cause = found.cause
         estimation = Estimation(found.navigator, found.stopwatch, guard, found.folder, progress, start_s)
         run, survey = conclude(estimation, _Replayed(opened, options, guard))
-    return _closed(checkpoints, ReplayResult(run.status, run.metrics, out, survey.result, survey.elevation))
-
-
-def _closed(checkpoints: Checkpoints, result: ReplayResult) -> ReplayResult:
-    checkpoints.remove()
-    remove_disparities(result.folder / "keyframes")  # which a checkpoint needs until now
-    return result
+    remove_state(checkpoints, out)
+    return ReplayResult(run.status, run.metrics, out, survey.result, survey.elevation)
 
 
 def _identity(opened: OpenedDataset, options: ReplayOptions) -> str:

@@ -5,17 +5,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.checkpoint import Checkpoints
 from twin.core.interrupts import StageGuard
 from twin.core.quality import Finding
 from twin.core.records import ElevationMap, MapGrid, SurveyResult
 from twin.core.timing import Stopwatch, timing_summary
 from twin.errors import SurveyAborted
 from twin.estimate.self_check import with_length_error
+from twin.estimate.vision.image_spool import remove_disparities
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.report.run_result import RunResult
 from twin.report.run_writer import RunFolder, SurveyRecord
@@ -37,15 +40,18 @@ class Estimation(NamedTuple):
         self, result: SurveyResult, grid: MapGrid | None, chosen: NDArray[np.bool_] | None = None
     ) -> ElevationMap | None:
         """Returns the elevation map from the chosen keyframes; None without any, or if an interrupt ends the stage."""
-        # also None if an image could not be read, or the last one not written; `guard.cause` then says why
-        report = partial(self.progress, "map")
-        try:
-            found = self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))
-            test = self.navigator.with_tested_sigma
-            return found and (self.guard.attempt("height check", lambda: test(result, found, chosen)) or found)
-        except OSError as error:
-            self.guard.cause = self.guard.cause or str(error)
-            return None
+        # without the last keyframe if an image cannot be read, as a full disk cut it; None if others cannot be read
+        # either; `guard.cause` then says why
+        report, test = partial(self.progress, "map"), self.navigator.with_tested_sigma
+        before = np.arange(len(result.keyframe_rows)) < len(result.keyframe_rows) - 1
+        for used in (chosen, before if chosen is None else chosen & before):
+            try:
+                found = self.guard.attempt("map", partial(self.navigator.build_map, result, grid, report, used))
+                tested = found and self.guard.attempt("height check", partial(test, result, found, used))
+                return tested or found
+            except OSError as error:
+                self.guard.cause = self.guard.cause or str(error)
+        return None
 
 
 class Maps(NamedTuple):
@@ -102,6 +108,12 @@ def conclude(estimation: Estimation, run: RunKind) -> tuple[RunResult, Evaluatio
     record = run.record(survey, SurveyRecord(result, maps.elevation, None, None, stopwatch, metrics))
     metrics = folder.finish(record, guard)
     return RunResult(metrics["status"], metrics, folder.path), survey
+
+
+def remove_state(checkpoints: Checkpoints, folder: Path) -> None:
+    """Removes what only a run in progress needs: its checkpoints and, on which they depend, the disparities."""
+    checkpoints.remove()
+    remove_disparities(folder / "keyframes")
 
 
 def finish_in_stage(navigator: Estimators, guard: StageGuard) -> SurveyResult:
