@@ -45,7 +45,7 @@ def source_files(key: str, group: str, name: str | None) -> list[Path]:
         return []
     module = load(key, group, name).__module__
     files = [getattr(sys.modules.get(one), "__file__", None) for one in (module.partition(".")[0], module)]
-    file = Path(next(filter(None, files)) or "")
+    file = Path(next(filter(None, files), ""))
     found = file.parent.rglob("*") if file.name == "__init__.py" else [file]
     return [one for one in found if one.is_file() and "__pycache__" not in one.parts]
 

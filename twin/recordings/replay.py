@@ -142,8 +142,7 @@ def _checkpoints(
     beside = [folder] if folder.is_file() else [file for file in folder.rglob("*") if file.suffix in _COMPARED]
     runs = {out.resolve(), *(file.resolve().parent for file in folder.rglob("env.json"))}  # results in the data set
     used = (file for file in (*beside, *filter(None, given)) if runs.isdisjoint(file.resolve().parents))
-    files = [file for file in used if is_file(file)]
-    files += source_files(ESTIMATOR_OPTION, ESTIMATORS, options.estimator)
+    files = *filter(is_file, used), *source_files(ESTIMATOR_OPTION, ESTIMATORS, options.estimator)
     return Checkpoints(out, {"replay": sha256(description.encode()).hexdigest()[:16]} | program(), files, interval_s)
 
 

@@ -102,7 +102,8 @@ class RunFolder:
         except OSError as error:
             shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
             for name in (self._reserve.name, _LOG, "scenario.resolved.toml", "env.json"):
-                (folder / name).unlink(missing_ok=True)
+                with suppress(OSError):
+                    (folder / name).unlink()
             raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder with space") from None
         self.log("started", time_s=0.0, name=scenario.name, seed=scenario.seed)
 
