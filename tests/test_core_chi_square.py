@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from twin.core.chi_square import chi2_quantile
@@ -15,6 +16,7 @@ def test_quantiles_are_those_of_scipy_stats_also_for_fractional_degrees_of_freed
         np.testing.assert_array_equal(chi2_quantile(p, k), stats.chi2.ppf(p, k))
 
 
+@pytest.mark.long
 def test_a_survey_does_not_import_scipy_stats():
     code = "import sys, twin.survey, twin.recordings.replay; assert 'scipy.stats' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

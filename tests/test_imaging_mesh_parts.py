@@ -95,7 +95,7 @@ def plainly_drawn(item: DrawnMesh, projection: Projection, target: Target) -> No
         target.label[rows, cols] = item.label
 
 
-@pytest.mark.parametrize("projection", (PERSPECTIVE, PARALLEL))
+@pytest.mark.parametrize("projection", (PERSPECTIVE, pytest.param(PARALLEL, marks=pytest.mark.long)))
 @pytest.mark.parametrize("name", MESHES)
 def test_an_image_is_that_of_all_triangles_one_by_one(name: str, projection: Projection) -> None:
     """To the last bit, over a floor that hides a part of the mesh, whether or not back faces are drawn."""

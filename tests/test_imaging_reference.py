@@ -185,7 +185,7 @@ def components(light):
     return *means, light.veil, light.total
 
 
-@pytest.mark.parametrize("phase", [ISOTROPIC, henyey_greenstein(0.7)])
+@pytest.mark.parametrize("phase", [ISOTROPIC, pytest.param(henyey_greenstein(0.7), marks=pytest.mark.long)])
 def test_both_estimators_agree(phase):
     """The textbook estimator shares neither guided directions nor connections with the other."""
     scene, ray = lit(BandWater(0.1, 0.5, phase)), central(looking_down(2.0), (60.0, 60.0))

@@ -91,6 +91,7 @@ def test_kept_code_is_read_in_its_intermediate_form_only_for_another_compilation
     assert printed(package, "-c", code) == ["True", "10.0", "False"]  # from the disk
 
 
+@pytest.mark.long
 def test_whether_a_module_has_compiled_code_is_known_without_its_import(package):
     command = "-c", "from twin.kernels import has_code; print(has_code('twin.callee'))"
     assert printed(package, *command) == ["False"]
@@ -125,6 +126,7 @@ def test_old_versions_of_a_module_are_removed(package):
     assert run(package)[1] == 1
 
 
+@pytest.mark.long
 def test_processes_that_compile_at_once_write_different_files(package):
     """One file with the code of the other process would be called with arguments of the wrong types."""
     run(package)

@@ -5,7 +5,14 @@ import pytest
 from twin.reproduce.relief_comparison import RELIEFS, relief_cells, relief_table
 
 
-@pytest.mark.parametrize(("water", "name"), [("IB", "box, shadow"), ("II", "box, shadow"), ("II", "cliff, far side")])
+@pytest.mark.parametrize(
+    ("water", "name"),
+    [
+        ("IB", "box, shadow"),
+        pytest.param("II", "box, shadow", marks=pytest.mark.long),
+        pytest.param("II", "cliff, far side", marks=pytest.mark.long),
+    ],
+)
 def test_light_in_a_shadow_and_beyond_an_edge_agrees_with_the_reference(water, name):
     """15 % of all light and 0.1 of the sharp share, which is the contrast of a texture, plus 2 standard errors."""
     total, sharp = (next(iter(relief_cells(((water,), (name,)), 8000))).light[key] for key in ("total", "sharp_share"))

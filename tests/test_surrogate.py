@@ -520,7 +520,10 @@ def test_errors_of_consecutive_motions_between_frames_are_anticorrelated():
     assert np.mean(found[1:] * found[:-1]) == pytest.approx(-a, abs=0.03)
 
 
-@pytest.mark.parametrize("scene", [pytest.param(s, marks=[pytest.mark.long] * (s == "auv")) for s in SCENES])
+OF_SECONDS = ("auv", "tank", "coral_garden", "quickstart")
+
+
+@pytest.mark.parametrize("scene", [pytest.param(s, marks=[pytest.mark.long] * (s in OF_SECONDS)) for s in SCENES])
 def test_the_surrogate_maps_every_shipped_scene(scene, tmp_path, outside_data, monkeypatch):
     if scene.startswith("horseshoe"):
         monkeypatch.setenv("TWIN_DATA", str(outside_data("horseshoe_reef_dem.tif").parent))
