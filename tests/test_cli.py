@@ -147,6 +147,11 @@ def test_run_folders_of_the_same_name_and_seed_are_numbered(tmp_path, monkeypatc
     assert [str(f) for f in folders] == ["runs/reef-3", "runs/reef-3-2", "runs/reef-3-3"]
 
 
+def test_a_folder_without_a_survey_cannot_be_resumed(tmp_path):
+    with pytest.raises(TwinError, match="no survey to resume"):
+        outputs.resumed(tmp_path, None)
+
+
 def test_an_empty_folder_is_accepted_and_any_other_path_is_not(tmp_path):
     assert outputs.new_folder(tmp_path) == tmp_path
     (tmp_path / "file").touch()

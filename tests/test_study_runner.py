@@ -129,6 +129,18 @@ def test_only_failed_surveys_are_flown_again(study, table, tmp_path):
     assert rows(tmp_path / "out").equals(table)
 
 
+def test_a_survey_whose_verdict_is_a_text_is_flown_again(study, table, tmp_path):
+    run_study(study, tmp_path / "out")
+    file = tmp_path / "out" / "rows.jsonl"
+    first, *others = file.read_text().splitlines(keepends=True)
+    verdict = next(key for key in json.loads(first) if key.startswith("require.") and key.endswith(".passed"))
+    file.write_text("".join([json.dumps(json.loads(first) | {verdict: "yes"}) + "\n", *others]))
+    again = SerialEngine()
+    run_study(study, tmp_path / "out", again, resume=True)
+    assert len(again.flown) == 1
+    assert rows(tmp_path / "out").equals(table)
+
+
 def test_a_survey_with_an_incomplete_row_is_flown_again(study, table, tmp_path):
     run_study(study, tmp_path / "out")
     file = tmp_path / "out" / "rows.jsonl"

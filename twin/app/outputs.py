@@ -44,7 +44,9 @@ def resumed(scene: str | Path, out: Path | None) -> tuple[str | Path, Path | Non
         return scene, out
     if out is not None and resolved(out) != resolved(Path(scene)):
         raise TwinError("--out", f"{out} is not the folder to resume, {scene}", "no --out with a run folder")
-    return Path(scene) / "scenario.resolved.toml", Path(scene)
+    if not (scenario := Path(scene) / "scenario.resolved.toml").is_file():
+        raise TwinError(str(scene), "has no scenario.resolved.toml, so no survey to resume", "the folder of a run")
+    return scenario, Path(scene)
 
 
 def output_file(file: Path, option: str = "--out") -> Path:

@@ -58,7 +58,8 @@ class ResultsLog:
                 except ValueError:
                     continue
                 if isinstance(row, dict) and all(isinstance(row.get(key), kind) for key, kind in _KEYS.items()):
-                    yield row
+                    if not any(isinstance(value, str) for key, value in row.items() if key.startswith("require.")):
+                        yield row
 
     def done(self) -> set[tuple[int, int]]:
         """Returns (sample, seed) of every survey whose last row does not have the status "failed"."""

@@ -261,7 +261,7 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
         if scale.min() < _LEAST_SCALE:
             break
         previous, plan = plan, make(whole)
-        same = np.equal(_spacing(plan), _spacing(previous))
+        same = np.equal(*((p.n_frames_per_keyframe, p.swath_spacing_m) for p in (previous, plan)))
         unchanged = np.where(same, unchanged + 1, 0)
         found = found if same.all() else _non_overlap(plan, pattern, field, rig)
     raise TwinError(
@@ -276,10 +276,6 @@ def _level_floor(request: SurveyRequest) -> HeightField:
     centre_m = request.area.centre_m if request.area else (0.0, 0.0)
     reach_m = 10 * (max(request.area_m) + max(request.footprint_m)) + 2 * float(np.hypot(*centre_m))
     return height_field(np.zeros((2, 2)), 2 * reach_m, -reach_m, -reach_m)
-
-
-def _spacing(plan: SurveyPlan) -> tuple[int, float]:
-    return plan.n_frames_per_keyframe, plan.swath_spacing_m
 
 
 def _non_overlap(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> Array:
