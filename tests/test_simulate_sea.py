@@ -219,13 +219,13 @@ def integrated(section, sea, start, commands, period_s):
 @pytest.mark.long
 @pytest.mark.parametrize("model", [*VEHICLE.built_in(), "coupled"])
 def test_trajectories_agree_with_an_independent_integration(model):
-    """Random thrust and angles of fins in a sheared, gusty, wavy current, 60 or 20 s: within 1 mm and 0.1 deg."""
+    """Random thrust and angles of fins in a sheared, gusty, wavy current, 30 or 20 s: within 1 mm and 0.1 deg."""
     if model == "coupled":
         section = coupled(np.random.default_rng(3))
     else:
         section = load_scenario("quickstart", [f"vehicle.model={model}"]).vehicle
     start = geometry.pose(geometry.rotation_from_rpy(0.05, -0.02, 0.5), np.array([0.0, 0.0, 2.0]))
-    n = 120 if model in ("bluerov2", "coupled") else 40
+    n = 60 if model in ("bluerov2", "coupled") else 40
     commands = np.random.default_rng(1).uniform(-0.35, 0.35, (n, section.n_commands))
     if section.is_steered_by_fins:
         commands[:, 0] = np.abs(commands[:, 0])  # ahead, so that the fins act

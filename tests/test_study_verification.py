@@ -59,6 +59,7 @@ imaging.fidelity = "surrogate"
 plan.area_m = [1.2, 0.8]
 plan.tracks = 1
 control.hold_s = 0.5
+rig.frame_rate_hz = 10
 
 [tune]
 objectives = ["timing.simulated_s"]

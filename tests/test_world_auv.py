@@ -183,7 +183,11 @@ def test_arcs_need_fins_and_fins_that_can_turn():
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "sets", [("imaging.fidelity=surrogate",), ("plan.tracks=1", "plan.area_m=[3.0,0.8]", "rig.frame_rate_hz=15")]
+    "sets",
+    [
+        ("imaging.fidelity=surrogate",),
+        ("plan.tracks=1", "plan.area_m=[2.0,0.8]", "rig.frame_rate_hz=15", "plan.overlap_along=0.75"),
+    ],
 )
 def test_surveys_by_the_surrogate_and_rendered_are_complete(tmp_path, sets):
     metrics = survey.run(load_scenario("auv", sets), tmp_path / "run", outputs=()).metrics
