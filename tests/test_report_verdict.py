@@ -159,6 +159,13 @@ def test_metrics_of_older_runs_keep_their_warning():
     assert headline.headline(older, {}) and headline.key_figures(older)
 
 
+def test_the_summary_says_how_well_the_scale_of_the_heights_was_tested():
+    tested = changed(self_check={"depth_scale": 0.98, "depth_scale_sigma": 0.0074})
+    untested = changed(self_check={"depth_scale": None, "depth_scale_sigma": None})
+    assert "tested the scale along the optical axis to 0.7 %: below that" in headline.headline(tested, {})
+    assert "No reading tested the scale" in headline.headline(untested, {})
+
+
 def test_the_sentence_on_the_observed_floor_names_the_map_where_no_area_was_asked_for():
     asked, observed = good(), changed(map={"completeness_area": None})
     assert " of the asked area; " in headline.headline(asked, {}) and " It covers " in headline.headline(asked, {})

@@ -26,6 +26,7 @@ MAX_DISPARITY_OFFSET_PX = 0.08  # offset of all disparities, estimated from the 
 MAX_DISTORTION_PX = 0.2  # disparity error by a radial distortion, and by the yaw that is estimated in its place
 MAX_LASTING = 1.0  # RMS of the residuals that successive readings of a sensor share / standard deviation of a reading
 MAX_SCALE_ERROR = 0.01  # relative difference of lengths from the images and from navigation sensors
+_SCALE_SIGMAS = 3.0  # the same in standard deviations; with 4, a third of the focal errors of 3 % would pass (limits.md)
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
 MAX_SCATTER = 2.0  # RMS difference of heights from two sets of keyframes / its standard deviation
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
@@ -226,7 +227,7 @@ def _scale(quality: EstimationQuality) -> list[Finding]:
         ("length_scale", quality.length_scale, "", "the baseline or the scale of the sensors"),
         ("depth_scale", quality.depth_scale, " along the optical axis", "the baseline or the focal length"),
     ):
-        if scale is not None and abs(scale.estimate - 1) > max(MAX_SCALE_ERROR, SIGNIFICANT * scale.sigma):
+        if scale is not None and abs(scale.estimate - 1) > max(MAX_SCALE_ERROR, _SCALE_SIGMAS * scale.sigma):
             ratio = f"{scale.estimate:.3f} +- {scale.sigma:.3f} times those of {scale.sensors}"
             text = f"the lengths{which} from the images are {ratio}: {cause} is not as calibrated"
             return [Finding(check, abs(scale.estimate - 1), MAX_SCALE_ERROR, text)]
