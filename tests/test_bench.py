@@ -88,7 +88,7 @@ def test_time_and_memory_of_a_process_are_its_own_and_a_failure_is_an_error():
 
 @pytest.mark.slow
 def test_the_benchmark_is_within_the_accepted_values():
-    command = [sys.executable, "-m", "twin", "bench", "--against", str(ACCEPTED)]
+    command = [sys.executable, "-m", "twin", "bench", "--full", "--against", str(ACCEPTED)]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True)
     found = json.loads(done.stdout)
     assert done.returncode == 0, found["problems"]
