@@ -102,6 +102,11 @@ class Terrain:
         """Returns `colours` as an image, painted at the first call."""
         return self.colours.image if isinstance(self.colours, PaintedTexture) else self.colours
 
+    def free_texture(self) -> None:
+        """Frees a painted texture, which cannot be painted again, as its random numbers are used up."""
+        if isinstance(self.colours, PaintedTexture):
+            vars(self.colours)["image"] = None
+
     @property
     def size_m(self) -> tuple[float, float]:
         ny, nx = self.height_m.shape

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.bench.measurement import BenchmarkRow, child_ms, child_peak_mb
+from twin.bench.measurement import BenchmarkRow, child_ms, child_ms_and_peak_mb
 from twin.bench.plain_renderer import PlainRenderer
 from twin.bench.report import as_json, read_accepted, table
 from twin.core import geometry
@@ -81,7 +81,8 @@ def test_json_and_table_have_every_measured_row():
 def test_time_and_memory_of_a_process_are_its_own_and_a_failure_is_an_error():
     """The memory of this process is larger, which `ru_maxrss` would return."""
     assert child_ms("-c", "sum(range(3_000_000))") > 10
-    assert 200 < child_peak_mb("block = b'1' * 200_000_000") < 240
+    assert 200 < child_ms_and_peak_mb("block = b'1' * 200_000_000")[1] < 240
+    assert child_ms_and_peak_mb("sum(range(3_000_000))")[0] > 10
     with pytest.raises(TwinError, match="ended with exit status 3"):
         child_ms("-c", "raise SystemExit(3)")
 

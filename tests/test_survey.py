@@ -1,6 +1,7 @@
 """Whole (small) surveys: closed loop, separation of truth and estimate, aids, partial runs."""
 
 import json
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from twin import survey
 from twin.core import records
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
-from twin.report.run_writer import OPTIONAL_OUTPUTS
+from twin.report import run_writer
 from twin.scenario import file as scenario_file
 from twin.session.assembly import image_vision, navigator_with
 from twin.world import rendered_world
@@ -33,7 +34,7 @@ def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> su
     scenario = scenario_file.load_scenario("reef", [*SMALL, *overrides])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twin.report.survey_page.surface_picture", lambda *_: None)
-        return survey.run(scenario, out, progress, outputs=OPTIONAL_OUTPUTS if report else ())
+        return survey.run(scenario, out, progress, outputs=run_writer.OPTIONAL_OUTPUTS if report else ())
 
 
 def image_navigator(mission, folder):
@@ -66,6 +67,25 @@ def test_the_run_folder_contains_every_documented_file(flown):
         assert (flown.folder / name).exists(), name
     assert not list((flown.folder / "keyframes").glob("*.npy"))  # disparities, which only the survey itself needs
     assert json.loads((flown.folder / "metrics.json").read_text()) == flown.metrics
+
+
+def test_the_texture_of_the_floor_is_freed_before_the_report(tmp_path, monkeypatch):
+    """It is the largest part of the memory, and the report takes as much again."""
+    textures, alive, opened, finish = [], [], rendered_world.RenderedWorld.__init__, run_writer.RunFolder.finish
+
+    def open_and_refer(world, mission, stopwatch):
+        opened(world, mission, stopwatch)
+        textures.append(weakref.ref(mission.terrain.texture))
+        alive.append(textures[0]() is not None)
+
+    def look_and_finish(folder, record, guard):
+        alive.append(textures[0]() is not None)
+        return finish(folder, record, guard)
+
+    monkeypatch.setattr(rendered_world.RenderedWorld, "__init__", open_and_refer)
+    monkeypatch.setattr(run_writer.RunFolder, "finish", look_and_finish)
+    assert fly(tmp_path / "run").metrics["orthomosaic"]["matched"] is not None  # the last that needs the texture
+    assert alive == [True, False]
 
 
 def test_the_resolved_scenario_flies_the_same_survey(flown):

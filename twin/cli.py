@@ -21,6 +21,7 @@ from twin import api
 from twin.app import console, outputs
 from twin.app.termination import INTERRUPTED, sigterm_as_interrupt
 from twin.core.output_folder import sole_writer
+from twin.core.user_files import resolved
 from twin.errors import TwinError
 
 if TYPE_CHECKING:
@@ -466,10 +467,9 @@ def replay(
         calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer),
         topics=recorded.image_topics(topics), estimator=estimator, aiding=aiding, true_map=true_map,
         rotation_sigma_deg=rotation_sigma, baseline_sigma_mm=baseline_sigma, imu=imu,
-        frames=recorded.frame_numbers(frames),
-        baseline_m=baseline, fov_deg=field,
+        frames=recorded.frame_numbers(frames), baseline_m=baseline, fov_deg=field,
     )  # fmt: skip
-    name = outputs.path_stem(dataset)
+    name = outputs.file_stem(resolved(dataset).name)
     if preview:
         _preview(dataset, options, outputs.output_file(out or Path(f"runs/{name}-preview.png")))
         return

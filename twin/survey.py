@@ -94,31 +94,31 @@ def _run(
 ) -> RunResult:  # fmt: skip
     guard, stopwatch = StageGuard(), Stopwatch()
     with guard, ExitStack() as opened:
-        fresh = opened.enter_context(open_world(mission, stopwatch))
-        survey: _Survey | None = checkpoints.open(resume, (*fresh.made_anew, progress))
-        if survey is None:
-            folder = opened.enter_context(RunFolder(out, mission.scenario, outputs))
-            _log_warnings(mission, fresh, folder)
-            monitor = SurveyMonitor(mission, folder, progress)
-            navigator = opened.enter_context(make_navigator(mission, fresh, out, stopwatch))
-            survey = _Survey(fresh, folder, monitor, navigator, stopwatch)
-        else:
-            opened.enter_context(survey.folder)
-            opened.enter_context(closing(survey.navigator))
-        world, folder, monitor = survey.world, survey.folder, survey.monitor
-        if live:
-            monitor.show_live(mission)
-        if not survey.flown:
-            images = mission.scenario.imaging.fidelity == "rendered" and outputs is not None
-            _fly_recorded(mission, survey, out, mission.scenario.record if images else "none", guard, checkpoints)
-        guard.cause = survey.cause
-        for event in world.faults.events:
-            folder.log("fault", **event.described)
-        for thruster in world.thruster_monitor.lost:
-            folder.log("thruster left out", **thruster._asdict())
-        warnings = (*world.warnings, *world.faults.sentences, *world.thruster_monitor.sentences)
-        actions = monitor.actions.times
-        flown = FlownSurvey(mission, world.truth(), warnings, actions, survey.gaps, world.detail_truth)
+        with open_world(mission, stopwatch) as fresh:
+            survey: _Survey | None = checkpoints.open(resume, (*fresh.made_anew, progress))
+            if survey is None:
+                folder = opened.enter_context(RunFolder(out, mission.scenario, outputs))
+                _log_warnings(mission, fresh, folder)
+                monitor = SurveyMonitor(mission, folder, progress)
+                navigator = opened.enter_context(make_navigator(mission, fresh, out, stopwatch))
+                survey = _Survey(fresh, folder, monitor, navigator, stopwatch)
+            else:
+                opened.enter_context(survey.folder)
+                opened.enter_context(closing(survey.navigator))
+            world, folder, monitor = survey.world, survey.folder, survey.monitor
+            if live:
+                monitor.show_live(mission)
+            if not survey.flown:
+                images = mission.scenario.imaging.fidelity == "rendered" and outputs is not None
+                _fly_recorded(mission, survey, out, mission.scenario.record if images else "none", guard, checkpoints)
+            guard.cause = survey.cause
+            for event in world.faults.events:
+                folder.log("fault", **event.described)
+            for thruster in world.thruster_monitor.lost:
+                folder.log("thruster left out", **thruster._asdict())
+            warnings = (*world.warnings, *world.faults.sentences, *world.thruster_monitor.sentences)
+            actions = monitor.actions.times
+            flown = FlownSurvey(mission, world.truth(), warnings, actions, survey.gaps, world.detail_truth)
         timed = survey.navigator, survey.stopwatch
         estimation = Estimation(*timed, guard, folder, monitor.report_stage, monitor.start_s)
         return conclude(estimation, flown)[0]

@@ -76,10 +76,6 @@ def file_stem(name: str) -> str:
     return text.encode("utf-8", "replace")[:_STEM_BYTES].decode("utf-8", "ignore")
 
 
-def path_stem(path: Path) -> str:
-    return file_stem(resolved(path).name)
-
-
 def _check_writable(path: Path, option: str) -> None:
     closest = next(p for p in (path, *path.absolute().parents) if p.exists())
     folder = closest.parent if closest == path and closest.is_file() else closest

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
@@ -44,21 +45,25 @@ def alternate(*works: Callable[[], object], n: int = N_ROUNDS) -> Array:
 
 def child_ms(*arguments: str) -> float:
     """Returns the processor time of Python with these arguments [ms]; TwinError if it fails."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    _child(*arguments)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return 1e3 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return _child(*arguments)[1]
 
 
-def child_peak_mb(code: str) -> float:
-    """Returns the peak memory of Python that runs `code` [MB], of Linux; TwinError if it fails."""
+def child_ms_and_peak_mb(code: str) -> tuple[float, float]:
+    """Returns processor time [ms] and peak memory [MB], of Linux, of Python that runs `code`; TwinError if it fails."""
     # not `ru_maxrss`, which is at least the memory of the parent
-    return float(_child("-c", f"{code}\nprint(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])")) / 1e3
+    peak_kb, ms = _child("-c", f"{code}\nprint(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])")
+    return ms, float(peak_kb) / 1e3
 
 
-def _child(*arguments: str) -> str:
-    done = subprocess.run([sys.executable, "-P", *arguments], capture_output=True, text=True, check=False)
+def _child(*arguments: str) -> tuple[str, float]:
+    """Returns the last word that Python with these arguments prints, and its processor time [ms]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with TemporaryDirectory(prefix="twin-") as folder:  # for files that it writes
+        command = [sys.executable, "-P", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         problem = f"ended with exit status {done.returncode}: {done.stderr.strip()[-200:]}"
         raise TwinError("bench", f"python {' '.join(arguments)[:80]} {problem}")
-    return done.stdout.split()[-1] if done.stdout else ""
+    ms = 1e3 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return (done.stdout.split() or [""])[-1], ms

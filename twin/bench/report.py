@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from twin.bench.measurement import N_ROUNDS, BenchmarkRow, alternate, child_ms, child_peak_mb
+from twin.bench.measurement import N_ROUNDS, BenchmarkRow, alternate, child_ms, child_ms_and_peak_mb
 from twin.bench.plain_renderer import PlainRenderer
 from twin.bench.stages import SMALL, stage_rows
-from twin.bench.surveys import surrogate_rows, survey_rows
+from twin.bench.surveys import folder_mb, study_row, surrogate_rows, survey_rows
 from twin.core.timing import Stopwatch
 from twin.scenario.file import load_scenario, read_toml, validated
 from twin.scenario.model import Section, Source
@@ -25,6 +25,7 @@ _LIBRARIES = "import numpy, scipy.sparse, cv2, numba, pydantic"
 _START = {
     "import": (("-c", "import twin.survey"), ("-c", _LIBRARIES), "import of its libraries"),
     "twin --help": (("-m", "twin", "--help"), ("-c", "import typer, rich.console"), "import of typer and rich"),
+    "twin plan": (("-m", "twin", "plan", "quickstart"), ("-c", "import twin.survey"), "import of the survey"),
 }
 
 
@@ -73,7 +74,8 @@ def measure(full: bool, progress: Callable[[str, float], None]) -> list[Benchmar
     if full:
         parts["large images"] = lambda: survey_rows("reef 640x480", "reef", (*SMALL, *_SIZES["640x480"]), N_ROUNDS)
         parts |= {scene: partial(survey_rows, scene, scene, SMALL, 1) for scene in _SCENES}
-        parts |= {"opening": lambda: [_opening_row("paper")], "memory": lambda: [*map(_memory_row, _SIZES)]}
+        parts |= {"opening": lambda: [_opening_row("paper")], "study": lambda: [study_row("turbidity")]}
+        parts["memory"] = _paper_rows
     rows = list[BenchmarkRow]()
     for k, (name, part) in enumerate(parts.items()):
         progress(name, k / len(parts))
@@ -97,11 +99,27 @@ def _opening_row(scene: str) -> BenchmarkRow:
     return BenchmarkRow(f"opening {scene}", "ms", ours, "mujoco.Renderer of its floor", floor)
 
 
-def _memory_row(size: str) -> BenchmarkRow:
-    with TemporaryDirectory(prefix="twin-") as folder:
-        keys = [*SMALL, *_SIZES[size]]
-        ours_mb = child_peak_mb(f"import twin; twin.run('paper', '{folder}/run', {keys})")
-    return BenchmarkRow(f"memory of paper {size}", "MB", [ours_mb])
+def _paper_rows() -> list[BenchmarkRow]:
+    """Returns the rows of processes that fly `paper`: small, 25 tracks of 30 m by the surrogate, tracks of 2 m."""
+    keys, short_tracks = _SIZES["320x240"], ("plan.area_m=[2.0,30.48]", 'record="none"')
+    surrogate = _run_paper(*keys, "imaging.fidelity=surrogate", outputs=", outputs=None")
+    long, short = (_run_paper(*keys, *short_tracks, f"plan.tracks={n}") for n in (25, 5))
+    small = {f"memory of paper {size}": _run_paper(*SMALL, *keys)[1] for size, keys in _SIZES.items()}
+    return [
+        *(BenchmarkRow(name, "MB", [peak_mb]) for name, peak_mb in small.items()),
+        BenchmarkRow("surrogate, 25 tracks", "ms", surrogate[:1]),
+        BenchmarkRow("surrogate, 25 tracks: memory", "MB", surrogate[1:2]),
+        BenchmarkRow("25 short tracks: memory", "MB", long[1:2], "5 short tracks", short[1:2]),
+        BenchmarkRow("25 short tracks: run folder", "MB", long[2:]),
+    ]
+
+
+def _run_paper(*overrides: str, outputs: str = "") -> tuple[float, float, float]:
+    """Returns processor time [ms], peak memory and run folder [MB] of `paper`, with its report unless `outputs`."""
+    with TemporaryDirectory(prefix="twin-") as temporary:
+        arguments = f"twin.load_scenario('paper', {[*overrides]}), pathlib.Path({temporary!r}) / 'run'{outputs}"
+        use = child_ms_and_peak_mb(f"import pathlib, twin, twin.survey; twin.survey.run({arguments})")
+        return *use, folder_mb(Path(temporary))
 
 
 def table(rows: Sequence[BenchmarkRow]) -> list[tuple[str, ...]]:
@@ -115,7 +133,7 @@ def table(rows: Sequence[BenchmarkRow]) -> list[tuple[str, ...]]:
 
 
 def as_json(rows: Sequence[BenchmarkRow], problems: Sequence[str]) -> dict[str, Any]:
-    lists = [{key: np.asarray(value).tolist() for key, value in row._asdict().items()} for row in rows]
-    spreads = [dict(zip(("median", "min", "max"), row.spread, strict=False)) for row in rows]
-    found = [fields | {"spread": spread} for fields, spread in zip(lists, spreads, strict=True)]
+    found = [{key: np.asarray(value).tolist() for key, value in row._asdict().items()} for row in rows]
+    for fields, row in zip(found, rows, strict=True):
+        fields["spread"] = dict(zip(("median", "min", "max"), row.spread, strict=False))
     return {"schema": "twin.bench/1", "rows": found, "problems": list(problems)}

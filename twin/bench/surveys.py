@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,22 +21,20 @@ from twin.report import recording, survey_page
 from twin.report.run_folder import load_run
 from twin.scenario.file import load_scenario
 from twin.session.assembly import make_navigator, open_world
+from twin.studies.flight import fly
+from twin.studies.study_file import load_study
+from twin.studies.surveys import refusals, surveys
 from twin.world.mission import prepare
 
 
 def survey_rows(label: str, scene: str, overrides: Sequence[str], n_rounds: int) -> list[BenchmarkRow]:
     """Returns the rows of a small survey of a scene: its processor time, report, recording, folder and accuracy."""
     flown = np.array([_survey(scene, overrides) for _ in range(n_rounds)]).T
-    parts = zip(("processor time", "report", "recording"), flown, strict=False)
+    timed, floor = ("processor time", "report", "recording"), "mujoco.Renderer, same views"
+    units = {"run folder": "MB", "final position error (RMSE)": "mm", "map error (LE90)": "mm", "NEES of position": "1"}
     return [
-        *(
-            BenchmarkRow(f"{label}: {name}", "ms", ours, "mujoco.Renderer, same views", flown[3])
-            for name, ours in parts
-        ),
-        BenchmarkRow(f"{label}: run folder", "MB", flown[4]),
-        BenchmarkRow(f"{label}: final position error (RMSE)", "mm", flown[5, :1]),
-        BenchmarkRow(f"{label}: map error (LE90)", "mm", flown[6, :1]),
-        BenchmarkRow(f"{label}: NEES of position", "1", flown[7, :1]),
+        *(BenchmarkRow(f"{label}: {name}", "ms", flown[k], floor, flown[3]) for k, name in enumerate(timed)),
+        *(BenchmarkRow(f"{label}: {name}", units[name], flown[k, :1]) for k, name in enumerate(units, 4)),
     ]
 
 
@@ -47,7 +46,7 @@ def _survey(scene: str, overrides: Sequence[str]) -> list[float]:
         folder = Path(temporary) / "run"
         survey_ms = processor_ms(lambda: results.append(survey.run(scenario, folder, outputs=())))
         run, metrics = results[0].contents, results[0].metrics
-        size_mb = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e6
+        size_mb = folder_mb(folder)
         poses = run.trajectories["truth"].world_from_camera
         views = [*poses, *(poses[run.keyframes.frames] @ mission.rig.left_from_right)]
         works: Sequence[Callable[[], object]] = (
@@ -58,6 +57,20 @@ def _survey(scene: str, overrides: Sequence[str]) -> list[float]:
         times = survey_ms, *map(processor_ms, works)
     errors_m = metrics["trajectory"]["final"]["ate_rmse_m"], metrics["map"]["le90_m"]
     return [*times, size_mb, *(1e3 * error_m for error_m in errors_m), metrics["consistency"]["nees_position_mean"]]
+
+
+def folder_mb(folder: Path) -> float:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e6
+
+
+def study_row(name: str) -> BenchmarkRow:
+    """Returns the processor time of surveys of a study in a process that has flown others of it before."""
+    study = load_study(name)
+    with TemporaryDirectory(prefix="twin-") as folder:
+        first, *others = islice(surveys(study, Path(folder), refusals(study), shuffled=True), 13)
+        fly(first)
+        times = [processor_ms(partial(fly, one)) for one in others]
+    return BenchmarkRow(f"survey of study {name}", "ms", times)
 
 
 def surrogate_rows() -> list[BenchmarkRow]:

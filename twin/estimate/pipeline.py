@@ -5,11 +5,11 @@ measurement of links are done at keyframes, and the global alignment (GA) at the
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,7 @@ class _Blindness(NamedTuple):
     motion: Array  #: (4, 4) product of the predicted visual motions
 
 
-class Navigator:
+class Navigator(AbstractContextManager["Navigator"]):
     """Estimates the trajectory of a stereo camera and the map from frames. Use as a context manager, or call `close`.
 
     Args:
@@ -116,9 +116,6 @@ class Navigator:
         vars(self).update(state)
         self._resources = _limited_resources()
         self._resources.callback(self.network.close)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -1,8 +1,8 @@
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ _PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern
 _PATTERN_CHANGE = 0.2
 
 
-class StereoVision:
+class StereoVision(AbstractContextManager["StereoVision"]):
     """`Vision` from recorded or rendered stereo images, binned as `stereo.choose_binning` tells at the first keyframe.
 
     Use as a context manager, or call `close`. `folder` is for the images of keyframes and the tiles of the mosaic.
@@ -79,15 +79,10 @@ class StereoVision:
         self.spool = ImageSpool(self._folder, binning)
         self._pattern_fits: dict[int, Array] = {}  # by frame index, as `_known_patterns` is
         self._known_patterns: dict[int, Array | None] = {}  # coefficients of that without which a pair was matched
-        self.f2f = FrameToFrame(
-            self.rig, self.settings.patch_px, self._imu_noise, self.settings.stops_if_blind
-        )  # fmt: skip
+        self.f2f = FrameToFrame(self.rig, self.settings.patch_px, self._imu_noise, self.settings.stops_if_blind)
         self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
         self._gray = self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
         self._image = self._gray.astype(np.uint8)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

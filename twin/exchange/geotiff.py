@@ -6,8 +6,9 @@ origin, from which `scene_placement` computes scene coordinates.
 """
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import rasterio
@@ -106,7 +107,7 @@ def _write(
         file.update_tags(**placement_tags(georeference))
 
 
-class OrthomosaicFile:
+class OrthomosaicFile(AbstractContextManager["OrthomosaicFile"]):
     """GeoTIFF of an orthomosaic (RGBA), written by tiles; a context manager, which removes it after an exception."""
 
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
@@ -115,9 +116,6 @@ class OrthomosaicFile:
         self._file = rasterio.open(path, "w", **layout, photometric="RGB", alpha="unspecified")
         self._file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         self._file.update_tags(**placement_tags(georeference))
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._file.close()

@@ -1,7 +1,7 @@
 """Estimator of another package in a survey (`estimate.plugin`) or a replay: map and metrics follow from its poses."""
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Self
 
 import numpy as np
 
@@ -25,7 +25,7 @@ NOTE = (
 _NO_POSE = "the plug-in measured no pose"
 
 
-class PluginNavigator:
+class PluginNavigator(AbstractContextManager["PluginNavigator"]):
     """Estimators whose poses come from a plug-in; keyframes, stereo matching and maps are those of a `Navigator`.
 
     The F2F and the online trajectory are the online poses of the plug-in; the final trajectory is the result of its
@@ -48,9 +48,6 @@ class PluginNavigator:
         self._node_covs: list[Array] = []
         self._twist = np.zeros(6)  # velocity at the last frame
         self._finishes = True
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -4,8 +4,9 @@ import csv
 from collections import deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Literal, Self, TextIO
+from typing import Any, Literal, TextIO
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ _PNG = [
 ]
 
 
-class FrameRecorder:
+class FrameRecorder(AbstractContextManager["FrameRecorder"]):
     """Writes frames to the folder `frames` of a run while the survey is flown. Use as a context manager.
 
     `frames.csv` has index, time, exposure and sensor readings (without beacons and IMU) of every frame, and whether it
@@ -67,9 +68,6 @@ class FrameRecorder:
         vars(self).update(state)
         self._writer = ThreadPoolExecutor(1)
         self._tables = {name: reopened(self._folder / name, length) for name, length in state["_tables"].items()}
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._writer.shutdown()

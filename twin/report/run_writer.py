@@ -80,7 +80,7 @@ class SurveyRecord:
     recorded_heights_m: NDArray[np.float32] | None = None  # (rows, cols) along the axis of height of the map
 
 
-class RunFolder:
+class RunFolder(AbstractContextManager["RunFolder"]):
     """Writer of a run folder and its log (log.jsonl, one JSON object per line). Use as a context manager.
 
     `scenario` is the resolved one, or the description of a run without one; `outputs` are the `OPTIONAL_OUTPUTS` to
@@ -114,9 +114,6 @@ class RunFolder:
         vars(self).update(state)
         self._log = reopened(self.path / _LOG, state["_log"])
         self._reserve.write_bytes(bytes(_RESERVE_BYTES))
-
-    def __enter__(self) -> "RunFolder":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._reserve.unlink(missing_ok=True)

@@ -13,10 +13,7 @@ from twin.report.plotting import WIDTH_IN, drawn, extent_of, hillshade, legend_b
 from twin.report.run_folder import Run
 from twin.report.style import COLOURS, ESTIMATES, LABELS
 
-PATH_STYLES: dict[str, dict[str, Any]] = {
-    "reference": {"linestyle": "--", "linewidth": 1.0},
-    "truth": TRUE_STYLE,
-}
+PATH_STYLES: dict[str, dict[str, Any]] = {"reference": {"linestyle": "--", "linewidth": 1.0}, "truth": TRUE_STYLE}
 
 
 def draw_all(run: Run, coverage: KeyframeCoverage | None = None) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 import base64
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +79,7 @@ def context(run: Run) -> dict[str, Any]:
         "samples": sample_images(run),
         "alignment": REPLAY_ALIGNMENTS[run.alignment or "first"],
         "scenario": read_text(run.folder / SCENARIO_FILE),
-        "environment": {key: _text(value) for key, value in run.environment.items()},
+        "environment": {key: v if isinstance(v, str) else json.dumps(v) for key, v in run.environment.items()},
         "colours": COLOURS,
     }
 
@@ -108,7 +107,3 @@ def jpeg_uri(image: NDArray[np.uint8] | None) -> str:
     if image is None:
         return ""
     return "data:image/jpeg;base64," + base64.b64encode(jpeg_bytes(image, IMAGE_PX)).decode()
-
-
-def _text(value: Any) -> str:
-    return json.dumps(value) if isinstance(value, Mapping | list) else str(value)

@@ -105,6 +105,7 @@ def conclude(estimation: Estimation, run: RunKind) -> tuple[RunResult, Evaluatio
     survey = replace(survey, timing=timing, identity=identity, orthomosaic=maps.orthomosaic)
     metrics = guard.attempt("evaluation", lambda: evaluate(survey)) or unevaluated(survey)
     progress("report", 0.0)
+    navigator.close()
     record = run.record(survey, SurveyRecord(result, maps.elevation, None, None, stopwatch, metrics))
     metrics = folder.finish(record, guard)
     return RunResult(metrics["status"], metrics, folder.path), survey

@@ -47,7 +47,9 @@ class FlownSurvey:
         with estimation.stopwatch("map"):
             elevation = estimation.build_map(result, self.mission.grid, chosen)
             details = tuple(estimation.build_map(result, d.grid, track_of == d.track) for d in self.mission.details)
-        return self._with_orthomosaic(estimation, result, elevation, chosen)._replace(details=details)
+        maps = self._with_orthomosaic(estimation, result, elevation, chosen)._replace(details=details)
+        self.mission.terrain.free_texture()
+        return maps
 
     def _with_orthomosaic(
         self, estimation: Estimation, result: SurveyResult, elevation: ElevationMap | None,

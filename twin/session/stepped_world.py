@@ -1,10 +1,10 @@
 """Simulated world that a program advances frame by frame (`twin.World`)."""
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from twin.scenario.model import Scenario
 from twin.session.assembly import Estimators, make_navigator, open_world
 from twin.session.mission_actions import MissionActions
 from twin.session.path_adaptation import PathAdaptation
-from twin.world.mission import Mission, prepare
+from twin.world.mission import prepare
 from twin.world.mission_flight import Flight
 from twin.world.pace import FULL, Pace
 from twin.world.pilot import make_pilot, without_feedback
@@ -31,7 +31,7 @@ class StereoPair(NamedTuple):
     right: Image
 
 
-class SteppedWorld:
+class SteppedWorld(AbstractContextManager["SteppedWorld"]):
     """Simulated world of a scenario, advanced frame by frame. Use as a context manager, or call `close`.
 
     `reset` starts the survey and returns its first frame; `step` moves the vehicle by one frame interval and returns
@@ -41,14 +41,11 @@ class SteppedWorld:
     """
 
     def __init__(self, scenario: Scenario):
-        self._mission = prepare(scenario)
+        self.mission = prepare(scenario)
         self._open = ExitStack()
         self._flight: Flight | None = None
         self._estimators: Estimators | None = None
         self._stopwatch = Stopwatch()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -71,12 +68,12 @@ class SteppedWorld:
         """
         self.close()
         self._open.enter_context(one_blas_thread())
-        scenario = self._mission.scenario
+        scenario = self.mission.scenario
         if seed is not None and seed != scenario.seed:
-            self._mission = prepare(scenario.model_copy(update={"seed": seed}))
+            self.mission = prepare(scenario.model_copy(update={"seed": seed}))
         self._stopwatch = Stopwatch()
-        world = self._open.enter_context(open_world(self._mission, self._stopwatch))
-        self._flight = Flight(self._mission, world)
+        world = self._open.enter_context(open_world(self.mission, self._stopwatch))
+        self._flight = Flight(self.mission, world)
         return self._flight.start()
 
     def step(self, command: Array, pace: Pace = FULL, keyframe: bool | None = None) -> Frame | None:
@@ -118,7 +115,7 @@ class SteppedWorld:
         """
         if folder is None:
             folder = Path(self._open.enter_context(TemporaryDirectory(prefix="twin-")))
-        opened = self._open.enter_context(make_navigator(self._mission, self.world, folder, self._stopwatch))
+        opened = self._open.enter_context(make_navigator(self.mission, self.world, folder, self._stopwatch))
         self._estimators = opened
         return opened
 
@@ -129,7 +126,7 @@ class SteppedWorld:
         `control.height`, `plan.fill_gaps` and a plug-in ask. Raises TwinError if the plug-in that the scenario names
         cannot be loaded.
         """
-        steer, flight = make_pilot(self._mission, self.world.thruster_monitor), self.flight
+        steer, flight = make_pilot(self.mission, self.world.thruster_monitor), self.flight
         adapt = PathAdaptation(flight, steer)
 
         def command(estimate: Estimate, frame: Frame) -> Array:
@@ -142,15 +139,11 @@ class SteppedWorld:
 
     def actions(self) -> MissionActions:
         """Returns the actions in poor visibility: a function from an estimate to the pace towards the next frame."""
-        return MissionActions(self._mission)
-
-    @property
-    def mission(self) -> Mission:
-        return self._mission
+        return MissionActions(self.mission)
 
     @property
     def rig(self) -> StereoRig:
-        return self._mission.rig
+        return self.mission.rig
 
     @property
     def world(self) -> World:

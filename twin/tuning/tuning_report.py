@@ -76,7 +76,7 @@ def paragraphs(result: TuningResult) -> list[Paragraph]:
         "chosen": chosen,
         "found": result.verification(chosen),
         "failed": failed,
-        "failed_values": failed and _values(failed.surrogate),
+        "failed_values": failed and [values_in_words(key, [v]) for key, v in failed.surrogate.values.items()],
         "limits": sentences.limits_in_words(limits),
         "required": required_probability(result.study),
         "varied": varied_in_words(result.study),
@@ -88,10 +88,6 @@ def paragraphs(result: TuningResult) -> list[Paragraph]:
 
 def headline(result: TuningResult) -> str:
     return lines_of(paragraphs(result))
-
-
-def _values(plan: Candidate) -> str:
-    return ", ".join(values_in_words(key, [value]) for key, value in plan.values.items())
 
 
 class ComparedPlan(NamedTuple):

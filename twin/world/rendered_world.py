@@ -34,18 +34,11 @@ class RenderedWorld(World):
         rig, rng = cameras.rendered_rig, streams(scenario.seed)
         timestep_s = physics_timestep_s(rig.frame_rate_hz, scenario.vehicle)
         self._model = build(timestep_s, scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2)
-        vehicle = (
-            MujocoVehicle(
-                self._model,
-                scenario.vehicle,
-                make_sea(scenario, rng["sea"]),
-                mission.start_of_body,
-                tether_of(scenario.tether, mission.start_of_body[:3, 3]),
-                mission.start_velocity_mps,
-            )
-            if scenario.vehicle.dynamics == "rigid"
-            else KinematicVehicle(mission.start_of_body)
-        )
+        vehicle: KinematicVehicle | MujocoVehicle = KinematicVehicle(mission.start_of_body)
+        if scenario.vehicle.dynamics == "rigid":
+            sea, tether = make_sea(scenario, rng["sea"]), tether_of(scenario.tether, mission.start_of_body[:3, 3])
+            start = mission.start_of_body, tether, mission.start_velocity_mps
+            vehicle = MujocoVehicle(self._model, scenario.vehicle, sea, *start)
         self._obstacles = Obstacles(mission)
         vehicle.touched = self._obstacles.touched
         noise, believed = scenario.believed_noise(), mission.rig
@@ -63,6 +56,10 @@ class RenderedWorld(World):
         self._surface = _overhanging_surface(mission, mission.grid)
         top_m = None if self._surface is None else self._surface.height_m
         self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m), top_m)
+
+    def __exit__(self, *_: object) -> None:
+        """Frees the floor of the renderer, a large part of the memory."""
+        self.renderer.close()
 
     @property
     def made_anew(self) -> tuple[object, ...]:

@@ -170,9 +170,7 @@ def _normal(depth, u, v, camera, focal_baseline, jump):
 
 
 @kernel
-def _backward_warp(
-    old, old_variance, guess, pose, step_cov, camera, focal_baseline, jump, depth, variance, first, end
-):  # fmt: skip
+def _backward_warp(old, old_variance, guess, pose, step_cov, camera, focal_baseline, jump, depth, variance, first, end):
     """Fills rows of depth and variance (H, W) of the old map in the new image, linearised at `guess` (H, W)."""
     focal, cx, cy = camera
     is_uncertain = np.trace(step_cov) > 0

@@ -85,11 +85,7 @@ class FrameToFrame:
         self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
     def step(
-        self,
-        image: matching.Image,
-        interval_s: float | None = None,
-        unusable: str = "",
-        imu: ImuReadings | None = None,
+        self, image: matching.Image, interval_s: float | None = None, unusable: str = "", imu: ImuReadings | None = None
     ) -> tuple[Motion, str]:
         """Returns the motion from the last frame to this normalised image, and "ok" or the reason for a failure.
 

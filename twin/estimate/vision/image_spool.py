@@ -70,8 +70,9 @@ class ImageSpool:
             writing.result()
 
     def close(self) -> None:
-        """Waits until all pairs are written, and ends the thread; an error of the last pair is not raised."""
+        """Waits until all pairs are written, ends the thread, frees the cache; an error of the last is not raised."""
         self._writer.shutdown()
+        self._gray.clear()
 
     def pair(self, row: int) -> tuple[Image, Image]:
         """Returns the left and the right image (H, W, 3) of the keyframe at frame index `row`."""

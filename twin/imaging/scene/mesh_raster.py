@@ -262,9 +262,7 @@ def _rectangle(ua, va, ub, vb, uc, vc, window):
 
 
 @kernel(error_model="numpy", forceinline=True)
-def _list_pixels(
-    faces, kept, n_kept, k, row, place, window, block_face, block_u, block_v, weight_b, weight_c, hits
-):  # fmt: skip
+def _list_pixels(faces, kept, n_kept, k, row, place, window, block_face, block_u, block_v, weight_b, weight_c, hits):
     """Lists pixels that the triangles `kept[k]` to `kept[n_kept - 1]` cover, from row `row` of the first on."""
     # by block of 2 x 2 pixels: triangle, first column and row, weights of the second and third corner; a hit is 4 times
     # the number of a block plus that of a pixel in it. Returns the number of hits, and `k` and `row` to go on from if

@@ -33,3 +33,7 @@ class Renderer:
 
         in_row_bands(render_rows, len(depth))
         return albedo, depth
+
+    def close(self) -> None:
+        """Frees the floor; nothing can be rendered any more."""
+        self.__dict__.clear()
