@@ -165,10 +165,14 @@ def test_the_cost_grows_with_frames_keyframes_and_pixels(summary):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("fidelity", ["rendered", "surrogate"])
-def test_time_memory_and_disk_of_a_run_are_about_those_expected(tmp_path, fidelity):
+@pytest.mark.parametrize(
+    ("fidelity", "floor"),
+    [("rendered", []), ("rendered", ["terrain.size_m=[20.0,20.0]", "terrain.grid_m=0.02"]), ("surrogate", [])],
+    ids=["rendered", "large floor", "surrogate"],
+)
+def test_time_memory_and_disk_of_a_run_are_about_those_expected(tmp_path, fidelity, floor):
     """Within 30 %; the time within a factor of two, as it depends on the processor and its load."""
-    short = ["plan.tracks=1", "control.hold_s=0.5", f"imaging.fidelity={fidelity}"]
+    short = ["plan.tracks=1", "control.hold_s=0.5", f"imaging.fidelity={fidelity}", *floor]
     overrides = [*short, "plan.area_m=[1.6,0.8]"]
     expected, folder = plan_summary.summarise(prepare(load_scenario("reef", overrides))).cost, tmp_path / "run"
     smaller = [*short, "plan.area_m=[0.6,0.4]"]

@@ -2,8 +2,9 @@
 
 The coefficients of rendered surveys are the times of the stages per frame and per keyframe that `twin bench` measures,
 at 320 x 240 and 640 x 480 pixels; the start is what a whole run of `reef` takes beyond these (imports, opening of the
-world, report, recording). Memory is the peak of the whole process, which the report reaches. Measured on a 2-core
-x86-64 machine without GPU, where compiled code is kept on disk; other machines may differ by a factor of two.
+world, report, recording). Memory is the peak of the whole process: of the report, or of the flight with a large
+texture, which is freed before the report. Measured on a 2-core x86-64 machine without GPU, where compiled code is kept
+on disk; other machines may differ by a factor of two.
 """
 
 from typing import NamedTuple
@@ -38,11 +39,12 @@ _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
 _RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=4.2)
 _DISPARITY_MB_PER_MPX = 4.0  # of one keyframe: two numbers of 16 bits a pixel
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
-_RENDERED_MB = _Coefficients(start=760.0, keyframe_mpx=7.0)
-_IMAGES_MB_PER_MPX = 300.0
-_SURROGATE_MB = 640.0
+_RENDERED_MB = _Coefficients(start=605.0, frame=0.006, keyframe_mpx=7.0)
+_IMAGES_MB_PER_MPX = 500.0
+_SURROGATE_MB = _Coefficients(start=555.0, frame=0.006)
+_REPORT_MB = 205.0  #: part of `start` of report and recording
 #: Memory of the floor [MB] of a rendered survey, per node of the height grid and per texel (see `terrains.terrain`).
-_NODE_MB, _TEXEL_MB = 400e-6, 9e-6
+_NODE_MB, _TEXEL_MB = 40e-6, 4e-6
 _WALL_CELL_MB, _WALL_TEXEL_MB = 36e-6, 14e-6  #: memory of walls [MB], per steep cell and per texel of their texture
 _FACE_MB, _MESH_TEXEL_MB = 80e-6, 4e-6  #: memory of a mesh floor [MB], per triangle and per texel of its textures
 
@@ -52,7 +54,7 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
     size = mission.n_frames, n_keyframes, megapixels
     if mission.scenario.imaging.fidelity == "surrogate":
         disk_mb = _SURROGATE_DISK_MB.total(*size)
-        return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB, disk_mb, disk_mb)
+        return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB.total(*size), disk_mb, disk_mb)
     window_tracks = mission.scenario.estimator_settings().window_tracks
     window = round(n_keyframes * min(1.0, (window_tracks + 1) / len(mission.tracks)))
     memory_mb = _RENDERED_MB.total(mission.n_frames, window, megapixels) + _IMAGES_MB_PER_MPX * megapixels
@@ -64,7 +66,7 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
 
 def _floor_mb(mission: Mission) -> float:
     terrain, walls, (rows, cols, _) = mission.terrain, mission.terrain.walls, mission.terrain.colours.shape
-    floor_mb = _NODE_MB * terrain.height_m.size + _TEXEL_MB * (rows * cols)
+    floor_mb = _NODE_MB * terrain.height_m.size + max(0.0, _TEXEL_MB * (rows * cols) - _REPORT_MB)
     if mission.mesh_floor is not None:
         tiles, textures = mission.mesh_floor.tiles
         n_faces = sum(len(tile.placed.model.levels[0].mesh.faces) for tile in tiles)
