@@ -58,9 +58,8 @@ def child_ms_and_peak_mb(code: str) -> tuple[float, float]:
 def _child(*arguments: str) -> tuple[str, float]:
     """Returns the last word that Python with these arguments prints, and its processor time [ms]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with TemporaryDirectory(prefix="twin-") as folder:  # for files that it writes
-        command = [sys.executable, "-P", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+    with TemporaryDirectory(prefix="twin-") as cwd:  # for files that it writes
+        done = subprocess.run([sys.executable, "-P", *arguments], capture_output=True, text=True, check=False, cwd=cwd)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         problem = f"ended with exit status {done.returncode}: {done.stderr.strip()[-200:]}"

@@ -20,7 +20,7 @@ from twin.session.assembly import open_world
 from twin.world.mission import prepare
 
 _SIZES = {f"{w}x{h}": (f"rig.image_width_px={w}", f"rig.image_height_px={h}") for w, h in ((320, 240), (640, 480))}
-_SCENES = "quickstart", "coral_garden", "paper"  #: with `reef`, those whose accuracy is measured
+_LARGE = "terrain.size_m=[40.0,40.0]", "terrain.grid_m=0.02"  #: a floor of 2001 x 2001 nodes
 _LIBRARIES = "import numpy, scipy.sparse, cv2, numba, pydantic"
 _START = {
     "import": (("-c", "import twin.survey"), ("-c", _LIBRARIES), "import of its libraries"),
@@ -73,9 +73,9 @@ def measure(full: bool, progress: Callable[[str, float], None]) -> list[Benchmar
     }
     if full:
         parts["large images"] = lambda: survey_rows("reef 640x480", "reef", (*SMALL, *_SIZES["640x480"]), N_ROUNDS)
-        parts |= {scene: partial(survey_rows, scene, scene, SMALL, 1) for scene in _SCENES}
-        parts |= {"opening": lambda: [_opening_row("paper")], "study": lambda: [study_row("turbidity")]}
-        parts["memory"] = _paper_rows
+        parts |= {one: partial(survey_rows, one, one, SMALL, 1) for one in ("quickstart", "coral_garden", "paper")}
+        parts["opening"] = lambda: [_opening_row("paper"), _opening_row("reef", " 2001x2001", *_LARGE)]
+        parts |= {"study": lambda: [study_row("turbidity")], "memory": _process_rows}
     rows = list[BenchmarkRow]()
     for k, (name, part) in enumerate(parts.items()):
         progress(name, k / len(parts))
@@ -89,22 +89,23 @@ def _start_row(name: str) -> BenchmarkRow:
     return BenchmarkRow(name, "ms", ours, label, floor)
 
 
-def _opening_row(scene: str) -> BenchmarkRow:
-    scenario = load_scenario(scene)
+def _opening_row(scene: str, size: str = "", *overrides: str) -> BenchmarkRow:
+    scenario = load_scenario(scene, overrides)
     mission = prepare(scenario)
     ours, floor = alternate(
         lambda: open_world(prepare(scenario), Stopwatch()),
         lambda: PlainRenderer(mission.terrain, mission.rig).__exit__(),
     )
-    return BenchmarkRow(f"opening {scene}", "ms", ours, "mujoco.Renderer of its floor", floor)
+    return BenchmarkRow(f"opening {scene}{size}", "ms", ours, "mujoco.Renderer of its floor", floor)
 
 
-def _paper_rows() -> list[BenchmarkRow]:
-    """Returns the rows of processes that fly `paper`: small, 25 tracks of 30 m by the surrogate, tracks of 2 m."""
+def _process_rows() -> list[BenchmarkRow]:
+    """Returns the rows of processes that fly small surveys, 25 tracks by the surrogate, and tracks of 2 m."""
     keys, short_tracks = _SIZES["320x240"], ("plan.area_m=[2.0,30.48]", 'record="none"')
-    surrogate = _run_paper(*keys, "imaging.fidelity=surrogate", outputs=", outputs=None")
-    long, short = (_run_paper(*keys, *short_tracks, f"plan.tracks={n}") for n in (25, 5))
-    small = {f"memory of paper {size}": _run_paper(*SMALL, *keys)[1] for size, keys in _SIZES.items()}
+    surrogate = _run("paper", *keys, "imaging.fidelity=surrogate", outputs=", outputs=None")
+    long, short = (_run("paper", *keys, *short_tracks, f"plan.tracks={n}") for n in (25, 5))
+    small = {f"memory of paper {size}": _run("paper", *SMALL, *keys)[1] for size, keys in _SIZES.items()}
+    small["memory of reef 2001x2001"] = _run("reef", *SMALL, *_LARGE)[1]
     return [
         *(BenchmarkRow(name, "MB", [peak_mb]) for name, peak_mb in small.items()),
         BenchmarkRow("surrogate, 25 tracks", "ms", surrogate[:1]),
@@ -114,10 +115,10 @@ def _paper_rows() -> list[BenchmarkRow]:
     ]
 
 
-def _run_paper(*overrides: str, outputs: str = "") -> tuple[float, float, float]:
-    """Returns processor time [ms], peak memory and run folder [MB] of `paper`, with its report unless `outputs`."""
+def _run(scene: str, *overrides: str, outputs: str = "") -> tuple[float, float, float]:
+    """Returns processor time [ms], peak memory and run folder [MB] of a survey, with its report unless `outputs`."""
     with TemporaryDirectory(prefix="twin-") as temporary:
-        arguments = f"twin.load_scenario('paper', {[*overrides]}), pathlib.Path({temporary!r}) / 'run'{outputs}"
+        arguments = f"twin.load_scenario({scene!r}, {[*overrides]}), pathlib.Path({temporary!r}) / 'run'{outputs}"
         use = child_ms_and_peak_mb(f"import pathlib, twin, twin.survey; twin.survey.run({arguments})")
         return *use, folder_mb(Path(temporary))
 
