@@ -17,6 +17,9 @@ def test_a_pair_larger_than_the_cache_is_still_returned(tmp_path, monkeypatch):
         for got, image, expected in zip(spool.gray(row), spool.pair(row), levels[2 * row : 2 * row + 2], strict=True):
             np.testing.assert_allclose(got, expected, atol=0.0625)  # half precision below 256
             np.testing.assert_allclose(matching.gray(image), expected)
+    spool.free_cache()
+    assert not spool._gray
+    np.testing.assert_allclose(spool.gray(1)[0], levels[2], atol=0.0625)  # is read again
     spool.close()
 
 

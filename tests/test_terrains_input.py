@@ -13,7 +13,7 @@ from twin.app.console import print_plan
 from twin.errors import TwinError
 from twin.judge.summary_statistics import finite_tree
 from twin.planning.summary import as_json, summarise
-from twin.report.input_rows import input_rows
+from twin.report.headline import input_rows
 from twin.report.run_folder import load_run
 from twin.report.survey_page import context
 from twin.scenario.file import load_scenario

@@ -137,7 +137,7 @@ def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
 
 def print_plan(summary: "PlanSummary") -> None:
     from twin.planning import summary as plan_summary
-    from twin.report.input_rows import input_rows
+    from twin.report.headline import input_rows
 
     print_table(f"Plan of {summary.mission.scenario.name}", plan_summary.rows(summary))
     if stated := input_rows(summary.mission.stated_input):

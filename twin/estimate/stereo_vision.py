@@ -249,6 +249,7 @@ class StereoVision(AbstractContextManager["StereoVision"]):
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
+        self.spool.free_cache()  # the map is made of images and disparities
         rows = result.keyframe_rows
         removed_rad = np.array([self.matcher.removed_yaw[row] for row in rows.tolist()])
         yaw_rad = result.quality.calibration.yaw_rad - removed_rad

@@ -5,7 +5,7 @@ from typing import Any, Literal, NamedTuple
 
 from twin.judge.map_error import INFINITE_WITH_HOLES
 from twin.judge.verdict import more_is_better, nees_bounds
-from twin.report.html import render_text
+from twin.report.html import render_rows, render_text
 from twin.report.number_formats import DASH, percent, with_unit
 from twin.report.words import words
 from twin.scenario.water_sources import WATER_SOURCES
@@ -109,6 +109,11 @@ def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     text = render_text("key_figures.txt.j2", {**metrics, "nees_bounds": nees_bounds(metrics["consistency"])})
     figures = [KeyFigure(*line.split(" | ")) for line in text.splitlines() if line]
     return [figure for figure in figures if figure.value != DASH] if metrics.get("replay") else figures
+
+
+def input_rows(stated: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Returns what is stated of a floor as text: pairs (name, value with evidence); [] for a generated floor."""
+    return render_rows("input.txt.j2", {"stated": stated}) if stated else []
 
 
 def conditions(scenario: Mapping[str, Any], visibility_m: float | None = None) -> str:

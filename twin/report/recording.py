@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -26,8 +27,9 @@ from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.scenario import file as scenario_file
 
-#: Largest number of keyframes whose images are logged; longest side of these images and of the orthomosaic [px].
-N_IMAGED, IMAGE_SIDE_PX, MOSAIC_PX = 500, 320, 1600
+#: Largest number of keyframes whose images are logged, and of images sent at once; longest side of these images and of
+#: the orthomosaic [px].
+N_IMAGED, N_SENT, IMAGE_SIDE_PX, MOSAIC_PX = 500, 50, 320, 1600
 #: Largest number of snapshots of growing entities (paths, network, map), samples of a curve, and ellipsoids.
 N_SNAPSHOTS, N_SAMPLES, N_ELLIPSOIDS = 24, 5000, 200
 #: Half axes of the ellipsoids [standard deviations], and the largest one drawn as a share of the extent of the path.
@@ -198,11 +200,10 @@ def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None
     )
     recording.send_columns("world/rig", time_columns(run, rows), columns)
     frames = [frame for frame in run.frames_with_image() if frame < len(path)]
-    for side in ("left", "right"):
-        blobs: dict[int, bytes] = {}
-        for frame in frames[:: stride(len(frames), N_IMAGED)]:  # one by one: 500 large images take 3 GB
-            if (image := read_rgb(run.image_file(frame, side))) is not None:
-                blobs[frame] = jpeg_bytes(image, IMAGE_SIDE_PX)
+    frames = frames[:: stride(len(frames), N_IMAGED)]
+    for side, first in product(("left", "right"), range(0, len(frames), N_SENT)):
+        images = ((frame, read_rgb(run.image_file(frame, side))) for frame in frames[first : first + N_SENT])
+        blobs = {frame: jpeg_bytes(image, IMAGE_SIDE_PX) for frame, image in images if image is not None}
         if blobs:
             columns = rr.EncodedImage.columns(blob=list(blobs.values()), media_type=["image/jpeg"] * len(blobs))
             recording.send_columns(f"world/rig/{side}", time_columns(run, np.array(list(blobs))), columns)

@@ -110,7 +110,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
 
 
 def _network(text: str) -> Network:
-    lines = [line.split() for line in text.splitlines()]
+    lines = [line.split(maxsplit=5) for line in text.splitlines()]
     nodes = [line for line in lines if line and line[0] == "VERTEX_SE3:QUAT"]
     pairs = [line[1:3] for line in lines if line and line[0] == "EDGE_SE3:QUAT"]
     row = {node[1]: k for k, node in enumerate(nodes)}

@@ -1,5 +1,7 @@
 """Writes a run folder: scenario and log during the survey, results after the survey, metrics.json last."""
 
+import ctypes
+import gc
 import json
 import os
 import platform
@@ -126,7 +128,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             self._log.write(json.dumps({"event": event, **fields}) + "\n")
             self._log.flush()
         except OSError:
-            pass
+            ctypes.CDLL(None).malloc_trim(0)
 
     def finish(self, record: SurveyRecord, guard: StageGuard) -> dict[str, Any]:
         """Writes all results, metrics.json last, and returns the metrics as written.
@@ -186,8 +188,14 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         return TiledMapFolder(self.path / "tiles")
 
     def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None], kept: Collection[str] = ()) -> None:
-        """Writes the files of a stage (`_FILES`); deletes all but the `kept` ones if an interrupt ends it."""
+        """Writes the files of a stage (`_FILES`); deletes all but the `kept` ones if an interrupt ends it.
+
+        First, memory that was freed before goes back to the system, where the C library can return it (glibc).
+        """
         n_skipped = len(guard.skipped)
+        gc.collect()
+        with suppress(AttributeError, OSError, TypeError):
+            ctypes.CDLL(None).malloc_trim(0)
         guard.attempt(stage, write)
         if len(guard.skipped) > n_skipped:
             for pattern in _FILES[stage]:
@@ -310,7 +318,6 @@ def environment() -> dict[str, str]:
 
     On different processors, or with different kernels of linear algebra (`blas`), results are rounded differently.
     """
-    names = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "rerun-sdk")
     return {
         "twin": version("seabed-twin"),
         "python": platform.python_version(),
@@ -319,4 +326,4 @@ def environment() -> dict[str, str]:
         "cpus": str(os.cpu_count()),
         "processor": llvmlite.binding.get_host_cpu_name(),
         "blas": " ".join(sorted({str(blas.get("architecture")) for blas in threadpool_info()})),
-    } | {name: version(name) for name in names}
+    } | {name: version(name) for name in ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "rerun-sdk")}

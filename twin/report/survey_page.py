@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from twin.core.user_files import read_text
 from twin.judge.map_error import cause_shares
 from twin.judge.standards import asprs_vertical_class_cm, iho_orders
-from twin.report.headline import REPLAY_ALIGNMENTS, badge, conditions, headline, key_figures, problems
+from twin.report.headline import REPLAY_ALIGNMENTS, badge, conditions, headline, input_rows, key_figures, problems
 from twin.report.html import render_page, render_text
 from twin.report.images import jpeg_bytes, read_rgb
-from twin.report.input_rows import input_rows
 from twin.report.keyframe_coverage import keyframe_coverage
 from twin.report.mesh_picture import surface_picture
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
@@ -36,12 +35,8 @@ def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
 
 def write_page(run: Run) -> Path:
     file = run.folder / "report.html"
-    file.write_text(render(run), encoding="utf-8")
+    file.write_text(render_page("twin.report", "survey_page.html.j2", context(run)), encoding="utf-8")
     return file
-
-
-def render(run: Run) -> str:
-    return render_page("twin.report", "survey_page.html.j2", context(run))
 
 
 def context(run: Run) -> dict[str, Any]:

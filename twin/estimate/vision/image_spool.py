@@ -72,18 +72,20 @@ class ImageSpool:
     def close(self) -> None:
         """Waits until all pairs are written, ends the thread, frees the cache; an error of the last is not raised."""
         self._writer.shutdown()
-        self._gray.clear()
+        self.free_cache()
+
+    def free_cache(self) -> None:
+        with self._lock:
+            self._gray.clear()
 
     def pair(self, row: int) -> tuple[Image, Image]:
         """Returns the left and the right image (H, W, 3) of the keyframe at frame index `row`."""
         return self.left(row), self.right(row)
 
     def left(self, row: int) -> Image:
-        self.flush()
         return self._read(row, "left")
 
     def right(self, row: int) -> Image:
-        self.flush()
         return self._read(row, "right")
 
     def disparity(self, row: int) -> Disparity:
@@ -126,6 +128,7 @@ class ImageSpool:
         return self.folder / f"{row:06d}_{side}{suffix}"
 
     def _read(self, row: int, side: str) -> Image:
+        self.flush()
         path = self._path(row, side)
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
