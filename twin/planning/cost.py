@@ -39,10 +39,10 @@ _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
 _RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=4.2)
 _DISPARITY_MB_PER_MPX = 4.0  # of one keyframe: two numbers of 16 bits a pixel
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
-_RENDERED_MB = _Coefficients(start=605.0, frame=0.006, keyframe_mpx=7.0)
+_RENDERED_MB = _Coefficients(start=555.0, frame=0.006, keyframe_mpx=7.0)
 _IMAGES_MB_PER_MPX = 500.0
-_SURROGATE_MB = _Coefficients(start=555.0, frame=0.006)
-_REPORT_MB = 205.0  #: part of `start` of report and recording
+_SURROGATE_MB = _Coefficients(start=507.0, frame=0.006)
+_REPORT_MB = 180.0  #: part of `start` of report and recording
 #: Memory of the floor [MB] of a rendered survey, per node of the height grid and per texel (see `terrains.terrain`).
 _NODE_MB, _TEXEL_MB = 40e-6, 4e-6
 _WALL_CELL_MB, _WALL_TEXEL_MB = 36e-6, 14e-6  #: memory of walls [MB], per steep cell and per texel of their texture
