@@ -8,8 +8,8 @@ import numpy as np
 
 from twin.core.records import Array, Image, MapGrid, Mask
 
-#: Side of a tile [px]. A tile in progress takes 24 bytes per pixel: with its margin, 114 MB.
-TILE_PX = 2048
+#: Side of a tile [px]. A tile in progress takes 24 bytes per pixel: with its margin, 32 MB.
+TILE_PX = 1024
 _ROWS = 64  # rows of a grid at whose centres a function is evaluated at once
 
 
@@ -42,7 +42,7 @@ def mean_colours(tile: OrthoTile, n: int) -> Image:
     """Returns the mean colours (rows // n, cols // n, 3) of the known pixels of squares of n x n pixels, or black."""
     rows, cols = (size // n for size in tile.rgba.shape[:2])
     squares, means = tile.rgba[: rows * n, : cols * n].reshape(rows, n, cols, n, 4), np.empty((rows, cols, 3), np.uint8)
-    for row in range(rows):  # one by one: a whole tile in float32 takes 67 MB
+    for row in range(rows):  # one by one: a whole tile in float32 takes 17 MB
         part = squares[row].astype(np.float32)
         known = part[..., 3:] > 0
         total = (part[..., :3] * known).sum(axis=(0, 2))
