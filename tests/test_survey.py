@@ -2,7 +2,7 @@
 
 import json
 import os
-import sys
+import platform
 import weakref
 from pathlib import Path
 
@@ -91,7 +91,7 @@ def test_the_texture_of_the_floor_is_freed_before_the_report(tmp_path, monkeypat
     assert alive == [True, False]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only glibc can return memory")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can return memory")
 def test_memory_that_was_freed_is_returned_before_a_report_is_written(tmp_path):
     """The C library keeps what lies below a block in use: 60 MB of a survey, to which the report would add its own."""
     folder = run_writer.RunFolder(tmp_path / "run", scenario_file.load_scenario("reef", SMALL))

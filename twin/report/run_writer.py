@@ -128,7 +128,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             self._log.write(json.dumps({"event": event, **fields}) + "\n")
             self._log.flush()
         except OSError:
-            ctypes.CDLL(None).malloc_trim(0)
+            pass
 
     def finish(self, record: SurveyRecord, guard: StageGuard) -> dict[str, Any]:
         """Writes all results, metrics.json last, and returns the metrics as written.
