@@ -80,6 +80,8 @@ def test_figures_of_a_survey_over_its_asked_area():
     assert data.covered == {1: 1.0, 2: 0.0, 5: 0.0, 10: 0.0}
     polygon = replace(run, scenario=run.scenario | {"plan": {"pattern": "lawnmower", "polygon": "area.kml"}})
     assert asked_area(polygon) == "0.5 square metres"
+    a_part = replace(run, keyframes=run.keyframes._replace(asked_m2=0.1))  # of the area, as few tracks were flown
+    assert asked_area(a_part) == "0.1 square metres"
     assert survey_data(replace(run, rasters={}), None) is None
 
 

@@ -27,8 +27,7 @@ from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.scenario import file as scenario_file
 
-#: Largest number of keyframes whose images are logged, and of images sent at once; longest side of these images and of
-#: the orthomosaic [px].
+#: Largest number of keyframes with images, and of images sent at once; longest side of these and the orthomosaic [px].
 N_IMAGED, N_SENT, IMAGE_SIDE_PX, MOSAIC_PX = 500, 50, 320, 1600
 #: Largest number of snapshots of growing entities (paths, network, map), samples of a curve, and ellipsoids.
 N_SNAPSHOTS, N_SAMPLES, N_ELLIPSOIDS = 24, 5000, 200

@@ -46,8 +46,9 @@ def asked_area(run: Run) -> str:
     plan, asked_m2 = run.scenario.get("plan", {}), run.keyframes.asked_m2
     if asked_m2 is None:
         return ""
-    if plan.get("polygon") is None and plan.get("pattern") == "lawnmower":
-        return " x ".join(f"{side:g} m" for side in plan["area_m"])
+    sides_m = plan["area_m"] if plan.get("polygon") is None and plan.get("pattern") == "lawnmower" else [0.0]
+    if np.isclose(np.prod(sides_m), asked_m2, rtol=0.05):  # not if `plan.tracks` cover only a part of it
+        return " x ".join(f"{side:g} m" for side in sides_m)
     return f"{asked_m2:.3g} square metres"
 
 
