@@ -88,7 +88,7 @@ def write_masks(
 
 
 def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georeference | None = None) -> None:
-    _write(path, np.moveaxis(mosaic, 2, 0), grid, georeference, nodata=0, photometric="RGB")
+    _write(path, np.moveaxis(mosaic, 2, 0), grid, georeference, nodata=0, photometric="RGB", predictor=2)
 
 
 def _write(
@@ -113,7 +113,7 @@ class OrthomosaicFile(AbstractContextManager["OrthomosaicFile"]):
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
         self._path = path
         layout = profile(grid, 4, "uint8", georeference) | {"tiled": True, "blockxsize": 256, "blockysize": 256}
-        self._file = rasterio.open(path, "w", **layout, photometric="RGB", alpha="unspecified")
+        self._file = rasterio.open(path, "w", **layout, photometric="RGB", alpha="unspecified", predictor=2, zlevel=9)
         self._file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         self._file.update_tags(**placement_tags(georeference))
 
