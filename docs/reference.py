@@ -16,7 +16,7 @@ from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.judge.survey_quality import self_check_metrics, stereo_quality
 from twin.judge.swaths import control_metrics, overlap_metrics
 from twin.judge.trajectory_errors import track_metrics, trajectory_metrics
-from twin.judge.verdict import MORE_IS_BETTER
+from twin.judge.verdict import MORE_IS_BETTER, SIGNED
 from twin.report.number_formats import unit_of
 from twin.scenario.model import Scenario
 from twin.studies.study_file import Study
@@ -35,9 +35,9 @@ METRICS_HEAD = """# Metrics
 
 Written by `python docs/reference.py docs/reference` from the functions in `twin/judge/` that compute `metrics.json`.
 A value that cannot be computed is null. `[require]` of a scenario or study limits any of them: from above, or from
-below where the table says "at least". `status` is "complete", "degraded" (a check of the estimators failed) or
-"aborted"; `reason` says why. The final path is after the alignment of all keyframes, the online one what the vehicle
-knew on the way, f2f the motion from frame to frame alone.
+below where the table says "at least"; of one that can be negative, the absolute value. `status` is "complete",
+"degraded" (a check of the estimators failed) or "aborted"; `reason` says why. The final path is after the alignment of
+all keyframes, the online one what the vehicle knew on the way, f2f the motion from frame to frame alone.
 
 """
 #: Functions that compute sections of metrics.json; their docstrings describe the keys.
@@ -72,7 +72,7 @@ def _metrics() -> str:
         text = re.split(r"\n\s*(?:Args|Raises):", inspect.getdoc(function) or "")[0]
         rows = ["| key | unit | `[require]` |", "|---|---|---|"]
         for key in _leaves(section, empty[section]):
-            limit = "at least" if key.startswith(MORE_IS_BETTER) else "at most"
+            limit = "at least" if key.startswith(MORE_IS_BETTER) else "at most" + " (absolute value)" * (key in SIGNED)
             rows.append(f"| `{key}` | {unit_of(key)} | {limit} |")
         table = "\n".join(rows) if len(rows) > 2 else "A list with one entry for each track."
         parts.append(f"## `{section}`\n\n{text.strip()}\n\n{table}\n")

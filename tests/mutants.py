@@ -137,7 +137,7 @@ MUTANTS = [
         ("twin/judge/map_error.py", "percent, method=\"higher\")", "percent, method=\"lower\")", "judge_area judge_metrics"),
         ("twin/judge/trajectory_errors.py", "return first_true @ geometry.inverse(first_estimated)", "return first_estimated @ geometry.inverse(first_true)", "judge_trajectory"),
         ("twin/judge/orthomosaic_errors.py", "hue = np.where(coloured, (h1 + h2) / 2 + across, h1 + h2)", "hue = np.where(coloured, (h1 + h2) / 2, h1 + h2)", "judge_metrics orthomosaic"),
-        ("twin/judge/verdict.py", "value >= limit if more_is_better(name) else value <= limit", "value > limit if more_is_better(name) else value < limit", "judge_metrics"),
+        ("twin/judge/verdict.py", "(abs(value) if name in SIGNED else value) <= limit", "(abs(value) if name in SIGNED else value) < limit", "judge_metrics"),
         # exchange
         ("twin/datasets/ros2/bag_writer.py", "return air_pa + PASCAL_PER_METRE * (surface_m - height_m)", "return air_pa + PASCAL_PER_METRE * (height_m - surface_m)", "exchange_ros2"),
         ("twin/exchange/geotiff.py", "cell = grid.cell_m / origin.metres_per_unit", "cell = grid.cell_m * origin.metres_per_unit", "world_placement"),

@@ -17,11 +17,13 @@ from twin import survey
 from twin.core import checkpoint
 from twin.core.checkpoint import FOLDER, Checkpoints
 from twin.core.interrupts import StageGuard
+from twin.core.records import Frame
 from twin.core.series import GrowingArray
 from twin.errors import TwinError
 from twin.estimate.vision.disparity import Disparity
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.tiles import TiledRaster
+from twin.report.frame_recorder import FrameRecorder
 from twin.report.run_writer import RunFolder
 from twin.scenario.file import dump_toml, input_files, load_scenario
 from twin.session.assembly import checkpoints_of
@@ -312,6 +314,40 @@ def test_a_disparity_that_a_full_disk_cut_is_a_read_error(tmp_path, length):
     file.write_bytes(file.read_bytes()[:length])
     with pytest.raises(OSError, match="000003_disparity.npy cannot be read"):
         spool.disparity(3)
+
+
+@pytest.mark.parametrize("kind", ["spool", "recorder"])
+def test_an_image_that_a_full_disk_lost_during_a_checkpoint_still_ends_the_flight(kind, tmp_path, monkeypatch):
+    write, image, full = Path.write_bytes, np.zeros((8, 8, 3), np.uint8), [True]
+
+    def write_bytes(file, data):
+        if full[0] and file.suffix == ".png":
+            raise OSError(28, "No space left on device", str(file))
+        return write(file, data)
+
+    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    frame = Frame(0, 0.0, image, None)
+    writer = ImageSpool(tmp_path / "keyframes") if kind == "spool" else FrameRecorder(tmp_path, "all")
+    add = {
+        "spool": lambda: writer.put(3, image, image, (image[..., 0], image[..., 0])),
+        "recorder": lambda: writer.add(frame, np.eye(4), np.zeros(6)),
+    }[kind]
+    add()
+    checkpoints = Checkpoints(tmp_path, {}, (), 1e-9)
+    checkpoints.open(False)
+    checkpoints.save_if_due(writer)
+    assert "No space left on device" in checkpoints.problem
+    full[0] = False
+    with pytest.raises(OSError, match="No space left on device"):
+        add()
+
+
+def test_a_checkpoint_that_failed_gives_its_space_to_the_results(tmp_path):
+    checkpoints = Checkpoints(tmp_path, {}, (), 1e-9)
+    checkpoints.open(False)
+    checkpoints.save_if_due("state")
+    checkpoints.save_last(lambda: None)  # cannot be saved
+    assert checkpoints.problem and not (tmp_path / FOLDER).exists()
 
 
 def test_a_start_that_is_refused_for_lack_of_space_leaves_no_files(tmp_path, monkeypatch):

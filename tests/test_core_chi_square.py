@@ -1,4 +1,4 @@
-"""Quantiles of the chi-square distribution equal those of scipy.stats; a survey does without its import."""
+"""The NEES interval is by quantiles of the chi-square distribution; a survey does without the import of scipy.stats."""
 
 import subprocess
 import sys
@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.core.chi_square import chi2_quantile
+from twin.estimate.vision.wide_search import _CHI2
+from twin.judge.consistency import CONSISTENT_SHARE, nees_interval
 
 
 def test_quantiles_are_those_of_scipy_stats_also_for_fractional_degrees_of_freedom():
-    for k in (1, 3, 6, 7.3, 1000.0):
-        p = np.array([1e-9, 0.005, 0.5, 0.995, 0.9999])
-        np.testing.assert_array_equal(chi2_quantile(p, k), stats.chi2.ppf(p, k))
+    for k in (1, 3, 7.3, 1000.0):
+        expected = stats.chi2.interval(CONSISTENT_SHARE, 3 * k)
+        np.testing.assert_allclose(nees_interval(k), np.array(expected) / k, rtol=1e-12)
+    assert pytest.approx(stats.chi2.ppf(0.9999, 6), rel=1e-12) == _CHI2
 
 
 @pytest.mark.long

@@ -54,7 +54,7 @@ NETWORKS = {
 
 
 def factor_of(symbolic, diagonal, off):
-    matrix = block_cholesky.BlockMatrix.allocate(symbolic)
+    matrix = block_cholesky.BlockMatrix(symbolic, np.empty(symbolic.offset[-1]))
     matrix.panels[:] = np.nan  # initial values are not used
     matrix.panels[:] = 0.0
     matrix.add(0, off[:3])

@@ -1,5 +1,7 @@
 """Tests of the storage of the keyframes' images."""
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -33,4 +35,21 @@ def test_a_damaged_image_is_an_error_that_names_its_file(tmp_path, contents):
     assert spool.left(3).shape == image.shape
     with pytest.raises(OSError, match="000003_right.png is damaged"):
         spool.pair(3)
+    spool.close()
+
+
+def test_threads_that_read_an_image_wait_until_it_is_written(tmp_path, monkeypatch):
+    may_write, image = threading.Event(), np.zeros((24, 32, 3), np.uint8)
+    write = image_spool.ImageSpool._write
+    monkeypatch.setattr(image_spool.ImageSpool, "_write", lambda *given: may_write.wait() and write(*given))
+    spool, found = image_spool.ImageSpool(tmp_path), []
+    spool.put(3, image, image, (matching.gray(image), matching.gray(image)))
+    readers = [threading.Thread(target=lambda: found.append(spool.left(3).shape)) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+        reader.join(0.1)
+    may_write.set()
+    for reader in readers:
+        reader.join()
+    assert found == [image.shape] * 3
     spool.close()

@@ -1,5 +1,7 @@
 """Exported maps: other programs read cells, points and triangles back at the right place with the right colours."""
 
+import resource
+from contextlib import contextmanager
 from dataclasses import replace
 
 import exported_run as made
@@ -167,3 +169,58 @@ def test_the_mesh_states_where_its_origin_lies(run, tmp_path):
 
 def test_a_foot_is_the_unit_of_a_crs_in_feet():
     assert geotiff.georeference_in("EPSG:2263", (0.0, 0.0, 0.0)).metres_per_unit == pytest.approx(1200 / 3937)
+
+
+@contextmanager
+def disk_for(n_bytes):
+    """Lets files grow to this size only, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def write_orthomosaic(file, grid, rgba):
+    with geotiff.OrthomosaicFile(file, grid) as written:
+        written.write(OrthoTile(grid, 0, 0, rgba))
+
+
+@pytest.mark.parametrize("side", [20, 300, 700])
+@pytest.mark.parametrize("kind", ["orthomosaic", "layer", "masks", "mosaic"])
+def test_a_file_that_a_full_disk_cuts_anywhere_is_an_error_and_is_removed(kind, side, tmp_path):
+    rng, grid = np.random.default_rng(1), MapGrid(0, 0, 0.01, side, side)
+    rgba = rng.integers(0, 256, (side, side, 4), np.uint8)
+    write = {
+        "orthomosaic": lambda file: write_orthomosaic(file, grid, rgba),
+        "layer": lambda file: geotiff.write_layer(file, rgba[..., 0] / np.float32(7), grid, "height"),
+        "masks": lambda file: geotiff.write_masks(file, {"one": rgba[..., 0], "two": rgba[..., 1]}, grid),
+        "mosaic": lambda file: geotiff.write_mosaic(file, rgba[..., :3], grid),
+    }[kind]
+    file = tmp_path / "a.tif"
+    write(file)
+    size = file.stat().st_size
+    with disk_for(size):
+        write(file)
+    for missing in (1, 100, 5000, 20_000, 60_000, size // 2):
+        if missing < size:
+            with pytest.raises(OSError), disk_for(size - missing):
+                write(file)
+            assert not file.exists(), missing
+
+
+def test_an_orthomosaic_that_may_exceed_four_gigabytes_has_large_offsets(tmp_path):
+    for side, start in ((1000, b"II*\0"), (24000, b"II+\0")):
+        with geotiff.OrthomosaicFile(tmp_path / "a.tif", MapGrid(0, 24, 0.001, side, side)):
+            pass
+        assert (tmp_path / "a.tif").read_bytes()[:4] == start
+
+
+def test_a_damaged_file_is_replaced(tmp_path):
+    grid, file = MapGrid(0, 1, 0.1, 300, 300), tmp_path / "a.tif"
+    rgba = np.random.default_rng(1).integers(0, 256, (300, 300, 4), np.uint8)
+    write_orthomosaic(file, grid, rgba)
+    file.write_bytes(file.read_bytes()[:-5000])
+    write_orthomosaic(file, grid, rgba)
+    assert geotiff.read_mosaic(file).values.shape == (300, 300, 3)

@@ -116,7 +116,9 @@ def test_an_interrupt_ends_only_the_current_stage(tmp_path, monkeypatch, stage):
 @pytest.mark.parametrize("finished", [True, False])
 def test_an_interrupt_of_the_map_files_keeps_an_orthomosaic_that_was_finished(tmp_path, monkeypatch, finished):
     def interrupted(folder, _):
-        (folder.path / "dem.tif").touch()
+        (folder.path / "task_1").mkdir()
+        for name in ("dem.tif", "task_1/mosaic.tif"):
+            (folder.path / name).touch()
         raise KeyboardInterrupt
 
     monkeypatch.setattr(RunFolder, "_write_trajectories", lambda *_: None)
@@ -127,7 +129,7 @@ def test_an_interrupt_of_the_map_files_keeps_an_orthomosaic_that_was_finished(tm
         (tmp_path / "mosaic.tif").touch()
         record = SurveyRecord(result, None, None, None, Stopwatch(), metrics, has_orthomosaic=finished)
         assert folder.finish(record, StageGuard())["reason"] == "interrupted; maps skipped"
-    assert {file.name for file in tmp_path.glob("*.tif")} == ({"mosaic.tif"} if finished else set())
+    assert list(tmp_path.rglob("*.tif")) == ([tmp_path / "mosaic.tif"] if finished else [])
 
 
 def test_metrics_that_cannot_be_written_are_an_error_of_the_out_option(tmp_path):

@@ -304,3 +304,8 @@ def test_a_map_without_estimates_has_completeness_zero_and_no_nan():
     empty = dataclasses.replace(ELEVATION, height_m=np.full_like(ELEVATION.height_m, np.nan))
     metrics = evaluate(EvaluationInput(RESULT, empty, TRUTH, RIG))["map"]
     assert metrics["completeness"] == 0 and metrics["rmse_m"] is None and metrics["max_m"] is None
+
+
+def test_a_least_height_is_a_lower_limit_and_a_bias_is_limited_to_both_sides():
+    assert [meets_limit("control.least_height_m", height, 0.5) for height in (0.01, 1.0)] == [False, True]
+    assert [meets_limit("map.bias_m", bias, 0.02) for bias in (-5.0, -0.01, 0.01, 5.0)] == [False, True, True, False]

@@ -47,6 +47,13 @@ def test_poses_are_associated_as_evo_does(pair, swapped):
     assert 30 < len(found.estimate) < 40
 
 
+def test_a_frame_counts_once_also_where_the_truth_is_denser_but_shorter_than_the_recording():
+    frames_s, true_s = np.arange(3030) / 30, np.arange(3000) / 100
+    found = associate(frames_s, true_s)
+    assert len(found.estimate) == len(np.unique(found.estimate)) == 900
+    assert np.abs(frames_s[found.estimate] - true_s[found.truth]).max() < 0.0051  # the nearest one
+
+
 @pytest.mark.parametrize("alignment", ["se3", "first", "none"])
 def test_the_absolute_trajectory_error_is_that_of_evo(pair, alignment):
     true, estimate = sync.associate_trajectories(evo(pair[1]), evo(pair[0]), max_diff=0.01)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import twin
+from twin.app import outputs
 from twin.core.output_folder import LOCK_FILE, sole_writer
 from twin.errors import TwinError
 from twin.studies.runner import open_folder
@@ -137,3 +138,13 @@ def test_resume_refuses_a_folder_of_another_kind_and_keeps_its_files(tmp_path, s
     with pytest.raises(TwinError, match=f"^--resume: {tmp_path} is not the folder of a {kind} "):
         open_folder(tmp_path, resume=True, search=search).__enter__()
     assert {name: (tmp_path / name).read_text() for name in files} == files
+
+
+def test_a_folder_that_may_not_be_read_is_one_line(tmp_path, monkeypatch):
+    def iterdir(folder):
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    assert refusal(tmp_path) == f"--out: {tmp_path} cannot be read: Permission denied (allowed: a folder of your own)"
+    with pytest.raises(TwinError, match="cannot be read: Permission denied"):
+        outputs.unused_folder(tmp_path)

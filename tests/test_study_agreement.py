@@ -114,3 +114,21 @@ def test_a_study_without_compare_has_no_agreement(tmp_path):
     analysis = analyse(tmp_path)
     analysis.study = analysis.study.model_copy(update={"compare": ()})
     assert agreement(analysis) is None
+
+
+def test_a_study_without_a_result_has_no_agreement(tmp_path):
+    assert agreement(StudyAnalysis(ResultsLog(tmp_path).table(), study_of(tmp_path, GATE))) is None
+
+
+def test_fidelities_that_are_no_names_are_refused(tmp_path):
+    both = '["rendered", "surrogate"]'
+    with pytest.raises(ScenarioError, match="needs surveys of both fidelities"):
+        study_of(tmp_path, GATE, (both, f"[{both}, {{ b = 1 }}]"))
+
+
+def test_a_search_that_varies_the_fidelity_is_refused(tmp_path):
+    tuned = (
+        '[tune]\nobjectives = ["map.le90_m"]\n[tune.search]\nplan.altitude_m = { uniform = [1.5, 3.0] }\n\n[require]'
+    )
+    with pytest.raises(ScenarioError, match="imaging.fidelity varies, but plans are verified with rendered images"):
+        study_of(tmp_path, GATE, ("[require]", tuned))

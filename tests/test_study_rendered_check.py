@@ -159,3 +159,7 @@ def test_the_surrogate_agrees_if_its_pass_rate_lies_in_the_interval_of_the_rende
 def test_without_surveys_near_the_limits_nothing_agrees():
     checked = RenderedCheck(np.zeros(0, bool), np.zeros(0, bool))
     assert not checked.agrees and checked.exit_status == 1 and "No survey" in checked.sentence()
+
+
+def test_a_study_without_a_result_has_no_survey_to_check(tmp_path):
+    assert len(nearest_surveys(StudyAnalysis(ResultsLog(tmp_path).table(), study_of(tmp_path, STUDY)), 5)) == 0

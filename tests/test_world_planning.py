@@ -121,6 +121,12 @@ def test_coverage_counts_the_asked_area_only(monkeypatch):
     assert reached_m < strip_m
 
 
+@pytest.mark.parametrize("area_m", ["[3.0, 1.6]", "[0.01, 0.01]"])
+def test_the_coverage_of_a_small_plot_does_not_depend_on_the_size_of_the_terrain(area_m, monkeypatch):
+    large = Terrain(np.zeros((601, 601), np.float32), 5.0, -1500.0, -1500.0, np.zeros((2, 2, 3), np.uint8), 1500.0)
+    assert forecast_over_floor(over(large, monkeypatch, f"plan.area_m={area_m}")).coverage == 1
+
+
 def test_a_survey_flown_as_planned_has_the_planned_overlap(monkeypatch):
     mission = over(terrains.generate("reef", (9.0, 7.0), 0.8, 0.0, 0.05, TextureSource(0.2), 5), monkeypatch)
     sequences = [mission.planned_frames(track) for track in mission.tracks]

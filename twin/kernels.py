@@ -208,13 +208,10 @@ def _reachable(file: Path) -> set[Path]:
 def _imports(file: Path) -> frozenset[Path]:
     names: set[str] = set()
     for dots, module, imported in _IMPORT.findall(file.read_text(encoding="utf-8")):
-        package = _package_of(file, len(dots)) + module
+        inside = _module_name(file.parents[len(dots) - 1] / "__init__.py").removesuffix("__init__") if dots else ""
+        package = inside + module
         names |= {package, *(f"{package}.{name}".lstrip(".") for name in _NAME.findall(imported))}
     return frozenset(path for name in names if (path := _file_of(name)) is not None)
-
-
-def _package_of(file: Path, level: int) -> str:
-    return _module_name(file.parents[level - 1] / "__init__.py").removesuffix("__init__") if level else ""
 
 
 @cache

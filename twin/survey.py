@@ -107,7 +107,9 @@ def _run(
                 opened.enter_context(closing(survey.navigator))
             world, folder, monitor = survey.world, survey.folder, survey.monitor
             if live:
-                monitor.show_live(mission)
+                from twin.report.recording import LiveViewer
+
+                monitor.live = LiveViewer(mission.rig)
             if not survey.flown:
                 images = mission.scenario.imaging.fidelity == "rendered" and outputs is not None
                 _fly_recorded(mission, survey, out, mission.scenario.record if images else "none", guard, checkpoints)
@@ -152,8 +154,6 @@ def _fly_recorded(
         survey.folder.log("flight ended early", reason=survey.cause)
     survey.loop, survey.recorder, survey.flown = None, None, True
     checkpoints.save_last(survey)
-    if checkpoints.problem:
-        checkpoints.remove()  # a full disk needs the space for the results
     if checkpoints.problem:
         survey.folder.log("no checkpoint", reason=checkpoints.problem)
 

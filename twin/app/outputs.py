@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from twin.core.output_folder import check_folder, check_path
+from twin.core.output_folder import check_folder, check_path, is_empty
 from twin.core.user_files import resolved
 from twin.errors import TwinError
 
@@ -26,7 +26,7 @@ def new_folder(folder: Path, option: str = "--out", used: bool = False) -> Path:
 def unused_folder(first: Path) -> Path:
     """Returns the first of FOLDER, FOLDER-2, FOLDER-3, ... that is new or empty, checked by `new_folder`."""
     folder, count = first, 1
-    while folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+    while folder.exists() and not (folder.is_dir() and is_empty(folder)):
         count += 1
         folder = first.with_name(f"{first.name}-{count}")
     return new_folder(folder)

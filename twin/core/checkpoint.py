@@ -101,9 +101,14 @@ class Checkpoints:
             self._save(state)
 
     def save_last(self, state: object) -> None:
-        """Saves the state before the last stages of the run, unless it has taken less time than the interval so far."""
+        """Saves the state before the last stages of the run, unless it has taken less time than the interval so far.
+
+        After a problem, removes the folder: a full disk needs the space for the results.
+        """
         if self._interval_s and time.perf_counter() - self._start_s >= self._interval_s:
             self._save(state)
+        if self.problem:
+            self.remove()
 
     def _save(self, state: object) -> None:
         """Saves a state; if this fails, the last one is kept, and `problem` says why."""

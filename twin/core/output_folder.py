@@ -52,8 +52,16 @@ def check_folder(folder: Path, option: str = "--out", used: bool = False, allowe
     check_path(folder, option, allowed)
     if folder.exists() and not folder.is_dir():
         raise TwinError(option, f"{folder} is not a folder", allowed)
-    if not used and folder.exists() and any(folder.iterdir()) and not (folder / LOCK_FILE).exists():
+    if not used and not is_empty(folder, option) and not (folder / LOCK_FILE).exists():
         raise TwinError(option, f"{folder} is not empty", allowed)
+
+
+def is_empty(folder: Path, option: str = "--out") -> bool:
+    """Returns whether a folder has no contents or does not exist; raises TwinError if it may not be read."""
+    try:
+        return not folder.exists() or not any(folder.iterdir())
+    except OSError as error:
+        raise TwinError(option, f"{folder} cannot be read: {error.strerror}", "a folder of your own") from None
 
 
 def check_path(path: Path, option: str, allowed: str) -> None:

@@ -73,14 +73,11 @@ class ReadingsBetweenNodes:
             if getattr(node.readings, name) is not None and (node.number, name) not in self._given:
                 continue
             motion, cov = motion_since(log, time_s, node.row)
-            if self._is_near(name, cov):
+            first, sigma = self._sigmas[name]
+            if np.diag(cov)[first : first + 3].max() <= (_MOST_ADDED * sigma) ** 2:
                 moved = self._moved(name, value, node.world_from_camera, motion)
                 node.readings = replace(node.readings, **{name: moved})
                 self._given.add((node.number, name))
-
-    def _is_near(self, name: str, cov: Array) -> bool:
-        first, sigma = self._sigmas[name]
-        return float(np.diag(cov)[first : first + 3].max()) <= (_MOST_ADDED * sigma) ** 2
 
     def _moved(self, name: str, value: Any, world_from_camera: Array, motion: Array) -> Any:
         """Returns a reading taken before a motion (4, 4) as it would be after it, at a pose (4, 4)."""

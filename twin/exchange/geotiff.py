@@ -5,8 +5,11 @@ they are in its coordinate reference system (CRS), with elevations above its ver
 origin, from which `scene_placement` computes scene coordinates.
 """
 
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+import errno
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +18,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
+from rasterio.errors import RasterioIOError
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
@@ -96,8 +100,7 @@ def _write(
     descriptions: tuple[str, ...] = (), tags: Mapping[str, str] | None = None, **options: Any,
 ) -> None:  # fmt: skip
     """Writes bands (n, rows, cols), one by one if they have descriptions and tags; `options` are those of rasterio."""
-    layout = profile(grid, len(bands), str(bands.dtype), georeference)
-    with rasterio.open(path, "w", **layout, **options) as file:
+    with _created(path, profile(grid, len(bands), str(bands.dtype), georeference) | options) as file:
         if not descriptions:
             file.write(bands)
         for band, description in enumerate(descriptions, start=1):
@@ -107,20 +110,43 @@ def _write(
         file.update_tags(**placement_tags(georeference))
 
 
-class OrthomosaicFile(AbstractContextManager["OrthomosaicFile"]):
+@contextmanager
+def _created(path: Path, layout: dict[str, Any]) -> Iterator[Any]:
+    """Opens a GeoTIFF to write in place of any other file; removes it after an exception."""
+    path.unlink(missing_ok=True)  # GDAL replaces no damaged file
+    try:
+        with rasterio.open(path, "w", **layout) as file:
+            yield file
+        check_written(path)
+    except BaseException as error:
+        path.unlink(missing_ok=True)
+        if isinstance(error, RasterioIOError) and error.__cause__ is not None:
+            raise OSError(errno.EIO, str(error.__cause__), str(path)) from error  # it refers to its cause only
+        raise
+
+
+def check_written(path: Path) -> None:
+    """Raises OSError if a file that was written is cut: on a full disk, GDAL ignores that the last writes failed."""
+    whole = False
+    with suppress(RasterioIOError), rasterio.open(path) as file:
+        (rows, cols), n_bytes = file.block_shapes[0], path.stat().st_size
+        blocks = product(range(-(-file.width // cols)), range(-(-file.height // rows)))
+        items = ([file.get_tag_item(f"BLOCK_{k}_{c}_{r}", "TIFF", 1) for k in ("OFFSET", "SIZE")] for c, r in blocks)
+        whole = all(start and size and int(start) + int(size) <= n_bytes for start, size in items)
+    if not whole:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+class OrthomosaicFile(ExitStack):
     """GeoTIFF of an orthomosaic (RGBA), written by tiles; a context manager, which removes it after an exception."""
 
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
-        self._path = path
-        layout = profile(grid, 4, "uint8", georeference) | {"tiled": True, "blockxsize": 256, "blockysize": 256}
-        self._file = rasterio.open(path, "w", **layout, photometric="RGB", alpha="unspecified", predictor=2, zlevel=9)
+        super().__init__()
+        tiles = {"tiled": True, "blockxsize": 256, "blockysize": 256, "bigtiff": "IF_SAFER"}
+        colours = {"predictor": 2, "zlevel": 9, "photometric": "RGB", "alpha": "unspecified"}
+        self._file = self.enter_context(_created(path, profile(grid, 4, "uint8", georeference) | tiles | colours))
         self._file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         self._file.update_tags(**placement_tags(georeference))
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._file.close()
-        if kind is not None:
-            self._path.unlink(missing_ok=True)
 
     def write(self, tile: OrthoTile) -> None:
         rows, cols = tile.rgba.shape[:2]

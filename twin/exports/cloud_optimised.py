@@ -76,3 +76,4 @@ def _optimised(path: Path, **options: str) -> Iterator[Path]:
 def _optimise(source: Path, path: Path, **options: str) -> None:
     with open_raster(source) as original:
         rasterio.shutil.copy(original, path, driver="COG", **_OPTIONS, **options)
+    geotiff.check_written(path)

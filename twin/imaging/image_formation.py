@@ -20,7 +20,7 @@ from twin.imaging.scene.mesh_raster import NO_OBJECTS, ObjectView
 from twin.imaging.scene.object_shadows import ObjectShadows, heights_with
 from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.imaging.snow import MarineSnow
-from twin.scenario.model import LampConfig, Scenario
+from twin.scenario.model import Scenario
 
 
 class StampedPose(NamedTuple):
@@ -63,7 +63,10 @@ class ImageFormation:
         self._rig, self._material = rig, material_of(scenario.terrain)
         self._objects = objects
         self._facets = None if floor is None else Facets(floor)
-        self._optics_of = cache(lambda lit: Optics(rig, illumination, _lit(scenario.lamps, lit)))
+        lamps = [(lamp.model_copy(update={"intensity_cd": 0.0}), lamp) for lamp in scenario.lamps]  # dark or lit
+        self._optics_of = cache(
+            lambda lit: Optics(rig, illumination, [one[on] for one, on in zip(lamps, lit, strict=True)])
+        )
         self._optics = self._optics_of((True,) * len(scenario.lamps))
         sources = self._optics.light_sources
         self._reference_depth_m, self._daylight_on = daylight.reference_depth_m, bool(daylight.surface_lx.any())
@@ -154,8 +157,3 @@ class ImageFormation:
 
     def _world_from_camera(self, camera: int, pose: StampedPose) -> Array:
         return pose.world_from_left @ (self._rig.left_from_right if camera else np.eye(4))
-
-
-def _lit(lamps: Sequence[LampConfig], lit: Sequence[bool]) -> list[LampConfig]:
-    """Returns the lamps, dark where they are not lit."""
-    return [lamp if on else lamp.model_copy(update={"intensity_cd": 0.0}) for lamp, on in zip(lamps, lit, strict=True)]

@@ -2,8 +2,8 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
-from twin.core.chi_square import chi2_quantile
 from twin.core.records import Array, ElevationMap, SurveyResult, Truth
 from twin.judge.map_error import normalised_error
 from twin.judge.summary_statistics import mean
@@ -67,5 +67,5 @@ def nees_interval(independent_errors: float | None) -> tuple[float, float] | Non
     if independent_errors is None:
         return None
     tail = (1 - CONSISTENT_SHARE) / 2
-    low, high = chi2_quantile([tail, 1 - tail], 3 * independent_errors) / independent_errors
+    low, high = chdtri(3 * independent_errors, [1 - tail, tail]) / independent_errors
     return float(low), float(high)

@@ -57,7 +57,7 @@ def associate(estimated_s: Array, true_s: Array) -> Associated:
     """Associates the poses of two trajectories by time as evo does (`evo.core.sync.associate_trajectories`).
 
     Each pose of the shorter trajectory goes with the nearest of the longer one, at times (n,) and (m,) [s] that differ
-    by at most `MAX_DIFFERENCE_S`.
+    by at most `MAX_DIFFERENCE_S`; unlike there, of several with the same one, only the closest goes with it.
     """
     truth_longer = len(true_s) > len(estimated_s)
     short, long = (estimated_s, true_s) if truth_longer else (true_s, estimated_s)
@@ -65,7 +65,10 @@ def associate(estimated_s: Array, true_s: Array) -> Associated:
         return Associated(np.zeros(0, np.int64), np.zeros(0, np.int64))
     order = np.argsort(long, kind="stable")
     nearest = order[nearest_index(long[order], short)]
-    kept = np.flatnonzero(np.abs(long[nearest] - short) <= MAX_DIFFERENCE_S)
+    differences = np.abs(long[nearest] - short)
+    closest = np.argsort(differences, kind="stable")
+    kept = np.sort(closest[np.unique(nearest[closest], return_index=True)[1]])
+    kept = kept[differences[kept] <= MAX_DIFFERENCE_S]
     return Associated(kept, nearest[kept]) if truth_longer else Associated(nearest[kept], kept)
 
 

@@ -10,14 +10,15 @@ from twin.errors import TwinError
 #: Prefixes of metrics whose limit is a lower bound. The limit of every other metric is an upper bound.
 MORE_IS_BETTER = (
     "map.completeness", "timing.real_time_factor", "overlap.", "consistency.within_", "vision.points_",
-    "vision.contrast_", "orthomosaic.coverage_", "orthomosaic.matched",
+    "vision.contrast_", "orthomosaic.coverage_", "orthomosaic.matched", "control.least_height_m", "water.",
+    "links.along.count", "links.across.count",
 )  # fmt: skip
 
-#: Metrics that can be negative, for which the ratio of two values has no meaning.
+#: Metrics that can be negative: their limit is one of the absolute value; the ratio of two values has no meaning.
 SIGNED = (
     "map.bias_m", "orthomosaic.bias_east_m", "orthomosaic.bias_north_m", "self_check.disparity_offset",
     "self_check.pitch_deg", "self_check.roll_deg", "self_check.row_offset_px", "self_check.row_shift",
-    "self_check.yaw_deg",
+    "self_check.yaw_deg", "self_check.calibration.yaw_deg", "self_check.calibration.baseline_error",
 )  # fmt: skip
 
 #: Bounds of the mean NEES of the positions: a survey is reported as inconsistent if its value is outside them and
@@ -63,7 +64,9 @@ def more_is_better(name: str) -> bool:
 
 
 def meets_limit(name: str, value: float | None, limit: float) -> bool:
-    return value is not None and (value >= limit if more_is_better(name) else value <= limit)
+    if value is None or more_is_better(name):
+        return value is not None and value >= limit
+    return (abs(value) if name in SIGNED else value) <= limit
 
 
 def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:

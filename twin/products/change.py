@@ -116,7 +116,8 @@ def _look(maps: tuple[Heights, Heights], stable: Mask, counted: Mask, side: int,
     errors = fitted(of_maps.difference_m, of_maps.sigma_m, grid.cell_m, stable)
     of_maps = register(*maps, stable, errors)
     known = np.isfinite(of_maps.difference_m)
-    sigma_m = np.sqrt(errors.sigma_m**2 + errors.long_sigma_m**2 + of_maps.sigma_of_cells_m**2)
+    by_registration_m2 = np.einsum("irc,ij,jrc->rc", of_maps.design, of_maps.cov, of_maps.design)
+    sigma_m = np.sqrt(errors.sigma_m**2 + errors.long_sigma_m**2 + by_registration_m2)
     mean_m, mean_sigma_m = _smoothed(of_maps, errors, sigma_m, side)
     mean_sigma_m *= _normal_scale((mean_m / mean_sigma_m)[stable])  # independent errors average out faster
     ratio, sigma_m = np.nan_to_num(mean_m / mean_sigma_m), np.where(known, sigma_m, np.nan)

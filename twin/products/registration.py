@@ -37,11 +37,6 @@ class MapRegistration(NamedTuple):
     difference_m: Layer  #: (rows, cols) second minus first map after the registration [m], NaN where one is unknown
     sigma_m: Layer  #: (rows, cols) standard deviation of the difference from those of both maps [m]
 
-    @property
-    def sigma_of_cells_m(self) -> Layer:
-        """Returns the standard deviation (rows, cols) of the difference of heights due to the registration [m]."""
-        return np.sqrt(np.einsum("irc,ij,jrc->rc", self.design, self.cov, self.design))
-
 
 def register(first: Heights, second: Heights, stable: Layer, errors: ErrorField | None = None) -> MapRegistration:
     """Returns the registration of two maps by robust least squares over the `stable` cells (rows, cols) of the first.

@@ -59,8 +59,8 @@ class FrameRecorder(AbstractContextManager["FrameRecorder"]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns the state after all images have been written; of the two tables, their lengths [bytes]."""
-        while self._waiting:
-            self._waiting.popleft().result()
+        for written in self._waiting:  # which stay, so that their errors also end the flight
+            written.result()
         lengths = {name: flushed_length(file) for name, file in self._tables.items()}
         return vars(self) | {"_writer": None, "_tables": lengths}
 

@@ -160,7 +160,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
                 for name in OPTIONAL_OUTPUTS:
                     if name in self._outputs:
                         self._attempt(guard, name, lambda name=name: _write_optional_output(name, written()))
-        except OSError as error:
+        except (OSError, TwinError) as error:  # the latter: a file just written cannot be read
             guard.cause = guard.cause or str(error)
         if guard.reason:
             degraded = f"; {metrics['reason']}" if metrics["status"] == "degraded" else ""
@@ -200,7 +200,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         if len(guard.skipped) > n_skipped:
             for pattern in _FILES[stage]:
                 for file in self.path.glob(pattern):
-                    if file.name not in kept:
+                    if file.relative_to(self.path).as_posix() not in kept:
                         file.unlink()
 
     def _write(self, name: str, text: str) -> None:

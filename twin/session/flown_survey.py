@@ -36,14 +36,10 @@ class FlownSurvey:
     #: returns the truth at the cells of the map of a task, from that of the survey and the rows of its keyframes
     detail_truth: Callable[[Detail, Truth, NDArray[np.int64]], Truth] | None = None
 
-    def _keyframes_of_area(self, result: SurveyResult) -> NDArray[np.bool_] | None:
-        """Returns the mask (n,) of the keyframes of the map of the area: all but those of tasks; None: all."""
-        tracks = [detail.track for detail in self.mission.details]
-        return ~np.isin(result.track_of_keyframe, tracks) if tracks else None
-
     def maps(self, estimation: Estimation, result: SurveyResult) -> Maps:
         """Builds the elevation map and, if maps are written or it is judged, the orthomosaic of the scenario."""
-        chosen, track_of = self._keyframes_of_area(result), result.track_of_keyframe
+        tracks, track_of = [detail.track for detail in self.mission.details], result.track_of_keyframe
+        chosen = ~np.isin(track_of, tracks) if tracks else None  # keyframes of the area, not of tasks; None: all
         with estimation.stopwatch("map"):
             elevation = estimation.build_map(result, self.mission.grid, chosen)
             details = tuple(estimation.build_map(result, d.grid, track_of == d.track) for d in self.mission.details)

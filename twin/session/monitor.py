@@ -40,17 +40,12 @@ class SurveyMonitor:
         self.n_frames, self.rate_hz = mission.n_frames, mission.rig.frame_rate_hz
         self.water = mission.scenario.water.label
         self.folder, self.progress, self.start_s = folder, progress, time.perf_counter()
-        self.live = None
+        self.live: Any = None  # a LiveViewer
         self.status = "ok"
         longest_s = _WITH_DVL_S if "dvl" in mission.scenario.navigation.aiding else _MAX_BLIND_S
         self._measured = deque([True] * round(longest_s * self.rate_hz))
         self.actions = MissionActions(mission, folder.log)
         self.max_sigma_m = _MAX_SIGMA * min(mission.plan.request.footprint_m)
-
-    def show_live(self, mission: Mission) -> None:
-        from twin.report.recording import LiveViewer
-
-        self.live = LiveViewer(mission.rig)
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"live": None, "start_s": self.wall_s}

@@ -61,7 +61,7 @@ class Faults:
         self._time_s = time_s
         for fault in [one for one in self._of_places if math.dist(one.at_m or (), camera_m[:2]) <= one.radius_m]:
             self._of_places.remove(fault)
-            self._spans.append((fault, (time_s, time_s + _lasting_s(fault))))
+            self._spans.append((fault, (time_s, time_s + (fault.duration_s or np.inf))))
         active = [fault for fault, (start, end) in self._spans if start - 1e-9 <= time_s < end - 1e-9]
         for starts, new, old in ((True, active, self._active), (False, self._active, active)):
             for fault in new:
@@ -135,7 +135,8 @@ class Faults:
         for n, (fault, (start_s, end_s)) in enumerate(self._spans):
             since_s = self._time_s - start_s
             if fault.type == "silt" and since_s >= 0:
-                share = silt_share(min(fault.size, 1.0), since_s, max(0.0, self._time_s - end_s))
+                settled = float(np.exp(-max(0.0, self._time_s - end_s) / _SETTLE_S))
+                share = min(fault.size, 1.0) * min(1.0, since_s / _RISE_S) * settled  # of the contrast
                 if share > _LEAST_SILT:
                     seen = [image if image is None else behind_silt(image, share, self._rng) for image in seen]
             elif fault.part == "fish" and 0 <= since_s < end_s - start_s:
@@ -193,7 +194,7 @@ class Faults:
 
 def _spans(fault: FaultConfig, duration_s: float, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
     """Yields start and end of each occurrence of a fault [s]."""
-    lasting_s = _lasting_s(fault)
+    lasting_s = fault.duration_s or np.inf
     if fault.start_s is not None:
         yield fault.start_s, fault.start_s + lasting_s
     if fault.per_hour is None:
@@ -202,15 +203,6 @@ def _spans(fault: FaultConfig, duration_s: float, rng: np.random.Generator) -> I
     while time_s < duration_s:
         yield time_s, time_s + lasting_s
         time_s += lasting_s + float(rng.exponential(3600 / fault.per_hour))
-
-
-def _lasting_s(fault: FaultConfig) -> float:
-    return np.inf if fault.duration_s is None else fault.duration_s
-
-
-def silt_share(size: float, since_start_s: float, since_end_s: float) -> float:
-    """Returns the share of the contrast that a cloud hides; `since_end_s` is 0 until it ends."""
-    return size * min(1.0, since_start_s / _RISE_S) * float(np.exp(-since_end_s / _SETTLE_S))
 
 
 def behind_silt(image: Image, share: float, rng: np.random.Generator) -> Image:

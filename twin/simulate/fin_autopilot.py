@@ -80,7 +80,8 @@ def fin_autopilot(vehicle: VehicleConfig, speed_mps: float, frame_rate_hz: float
     configuration, movable = angular_first(parameters_of(nominal).thrust_configuration), fins.max_rad > 0
 
     def row(found: Trim) -> Array:
-        attitude = [found.roll, found.pitch, found.yaw_from_course]
+        course = geometry.rotation_from_rpy(found.roll, found.pitch, 0.0) @ found.twist[3:]
+        attitude = [found.roll, found.pitch, -np.arctan2(course[1], course[0])]  # the yaw against the course
         return np.concatenate([attitude, found.twist, [found.thrust_n] * n, found.angles_rad[movable]])
 
     def rates(values: Array) -> Array:

@@ -32,12 +32,6 @@ class Trim(NamedTuple):
     thrust_n: float  #: of each thruster
     angles_rad: Array  #: (n,) of the fins
 
-    @property
-    def yaw_from_course(self) -> float:
-        """Returns the yaw of the bow minus that of the direction of motion [rad]."""
-        course = geometry.rotation_from_rpy(self.roll, self.pitch, 0.0) @ self.twist[3:]
-        return float(-np.arctan2(course[1], course[0]))
-
 
 def accelerated(hull: Hull, fins: Fins, rotation: Array, twist: Array, thrust: Array, angles_rad: Array) -> Array:
     """Returns the `acceleration` (6,) in still water under a wrench of the thrusters (6,) and angles of the fins."""

@@ -71,7 +71,7 @@ class Agreement(NamedTuple):
 
 def agreement(analysis: StudyAnalysis) -> Agreement | None:
     """Returns the agreement of a study's pairs; None if the study compares no metrics or no pair has two results."""
-    if not analysis.study.compare:
+    if not analysis.study.compare or not analysis.evaluated.any():
         return None
     rendered, surrogate = (analysis.passed[rows] for rows in pairs(analysis))
     if len(rendered) == 0:

@@ -111,10 +111,10 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
     metric farthest beyond its limit counts, or else the one closest to it. Surveys without a finite value of every
     required metric are left out.
     """
+    if not analysis.limits or not analysis.evaluated.any():
+        return np.zeros(0, np.int64)
     is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
     chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
-    if not analysis.limits:
-        return np.zeros(0, np.int64)
     values = {name: analysis.numbers(name)[chosen] for name in analysis.limits}
     excess = [_excess(values[name], limit) * (1 - 2 * more_is_better(name)) for name, limit in analysis.limits.items()]
     finite = np.isfinite(list(values.values())).all(axis=0)

@@ -110,7 +110,7 @@ def more_needed(undecided: list[Answer]) -> str:
     numbers = np.array([answer.more_surveys for answer in undecided])
     if np.isinf(numbers).any():
         if any(answer.unknown for answer in undecided):
-            return "some of the results are unknown: --render-refused flies them"
+            return "some of the results are unknown: --resume flies failed surveys, --render-refused refused ones"
         return "no finite number of surveys is expected to decide it: the observed fraction equals the required one"
     if np.isnan(numbers).any():
         return "more surveys there narrow it"

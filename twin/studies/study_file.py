@@ -268,9 +268,12 @@ def _goal_rules(study: Study) -> Iterator[Rule]:
     for name in study.compare:
         problem = f"{name} can be negative, but the ratio of its medians is compared"
         yield name in SIGNED, "compare", problem, "metrics that are never negative, such as map.rmse_m"
-    has_both = fidelity is not None and fidelity.grid is not None and set(fidelity.grid) == FIDELITIES
+    listed = {*map(repr, fidelity.grid or ())} if fidelity is not None else set()
+    has_both = listed == {*map(repr, FIDELITIES)}
     single, allowed = bool(study.compare) and not has_both, "vary.imaging.fidelity with a grid of both"
     yield single, "compare", "needs surveys of both fidelities", allowed
+    varies = study.tune is not None and FIDELITY in {*study.varied_keys, *study.tune.search}
+    yield varies, "tune", f"{FIDELITY} varies, but plans are verified with rendered images", "one fidelity"
     if study.seek is not None:
         law = study.vary.get(study.seek)
         is_numeric = law is not None and all(isinstance(value, int | float) for value in law.values)

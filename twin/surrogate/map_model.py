@@ -155,7 +155,8 @@ class MapModel:
         mapped_m = cell_view.mapped_heights(self._cells, self._cameras, index, observed.true, observed.estimated)
         height[i, k] = mapped_m + error
         variance[i, k] = typical_m**2
-        pose[i, k] = self._pose_variances(observed.estimated, cov, index)
+        turn = geometry.adjoint(geometry.pose(observed.estimated[:3, :3], np.zeros(3)))
+        pose[i, k] = cell_view.pose_variances(self._cells, index, observed.estimated[:3, 3], turn @ cov @ turn.T)
         systematic[i, k] = pose[i, k] + lateral_m**2
         if not np.isfinite(np.stack([values[i, k] for values in (height, variance, systematic)])).all():
             raise FloatingPointError("the error model gives a height or a variance that is not finite")
@@ -179,11 +180,6 @@ class MapModel:
             self._conditions[:, last] = cells
             self.n_heights[last] += 1
         return last, cells
-
-    def _pose_variances(self, estimated: Array, cov: Array, index: Index) -> Array:
-        """Returns the variances (n,) of the heights due to the error of a pose, with `cov` (6, 6) in its axes."""
-        rotation = geometry.adjoint(geometry.pose(estimated[:3, :3], np.zeros(3)))
-        return cell_view.pose_variances(self._cells, index, estimated[:3, 3], rotation @ cov @ rotation.T)
 
     def _window(self, index: Index) -> tuple[int, int, tuple[int, int]]:
         rows, cols = index // self.grid.cols, index % self.grid.cols

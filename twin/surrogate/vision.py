@@ -79,10 +79,6 @@ class KeyframeTruth(NamedTuple):
         moved_m = self.pose[:3, 3] - earlier_pose[:3, 3]
         return self.unevenness_px * math.sqrt(moved_m.dot(moved_m)) * self.disparity / self.baseline_m
 
-    def distance_in_depths(self, a_from_b: Array) -> float:
-        """Returns the length of a motion's translation multiplied by the mean inverse depth of the points."""
-        return float(np.linalg.norm(a_from_b[:3, 3])) * self.disparity / self.baseline_m
-
 
 class FrameErrors(NamedTuple):
     """Distribution of the errors of frame-to-frame motions until the next keyframe."""

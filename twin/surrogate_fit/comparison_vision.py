@@ -151,7 +151,8 @@ class ComparisonVision:
             return
         cov = known["patches"].cov
         self.statistics["link_reported_ratio"].append(_sigma_ratio(measured.cov, cov))
-        self.statistics["link_distance"].append(self.surrogate.latest.distance_in_depths(true))
+        depths = float(np.linalg.norm(true[:3, 3])) * self.surrogate.latest.disparity / self.surrogate.latest.baseline_m
+        self.statistics["link_distance"].append(depths)
         errors = {name: geometry.log(geometry.inverse(true) @ motion.a_from_b) for name, motion in known.items()}
         for name, error in errors.items():
             self.statistics[f"link_nees_{name}"].append(_chi2(error, cov) / 6)

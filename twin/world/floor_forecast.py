@@ -16,7 +16,7 @@ from twin.world.planning import floor_of, planned_keyframes
 from twin.world.top_surface import with_objects
 
 _OVERLAP_PAIRS = 1000  #: largest number of pairs from which a median overlap is forecast
-_COVERAGE_CELLS = 1000  #: largest number of cells of the grid of the coverage along the longer side of the terrain
+_COVERAGE_CELLS = 1000  #: largest number of cells of the grid of the coverage along the longer side of the asked area
 
 
 class Spread(NamedTuple):
@@ -114,16 +114,17 @@ def _row_statistic(statistic, values: Array) -> Array:
 
 
 def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
-    grid = _grid_of_terrain(mission)
+    grid = _grid_of_area(mission)
     seen = seen_over(grid, mission.rig, field, poses)
     x, y = np.meshgrid(*grid.centres())
     asked = mission.asked(x, y)
     return float(seen[asked].mean()) if asked.any() else 0.0
 
 
-def _grid_of_terrain(mission: Mission) -> MapGrid:
-    """Returns a grid over the terrain with cells as in the map, or at most _COVERAGE_CELLS along a side."""
-    t = mission.terrain
-    cell_m = max(mission.grid.cell_m, max(t.size_m) / _COVERAGE_CELLS)
-    cols, rows = (max(1, int(side / cell_m)) for side in t.size_m)
-    return MapGrid(t.west_m, t.north_m, cell_m, rows, cols)
+def _grid_of_area(mission: Mission) -> MapGrid:
+    """Returns a grid over the asked area with cells as in the map, or at most _COVERAGE_CELLS along a side."""
+    outline = mission.plan.area.outline()
+    sides_m, middle = np.ptp(outline, axis=0), (outline.min(axis=0) + outline.max(axis=0)) / 2
+    cell_m = max(mission.grid.cell_m, float(sides_m.max()) / _COVERAGE_CELLS)
+    cols, rows = (max(1, round(side / cell_m)) for side in sides_m)
+    return MapGrid(middle[0] - cols * cell_m / 2, middle[1] + rows * cell_m / 2, cell_m, rows, cols)

@@ -73,10 +73,6 @@ class BlockMatrix(NamedTuple):
     symbolic: SymbolicFactor  #: sparsity pattern and memory layout
     panels: Array  #: values of all panels in one long array, modified in place
 
-    @classmethod
-    def allocate(cls, symbolic: SymbolicFactor) -> BlockMatrix:
-        return cls(symbolic, np.empty(symbolic.offset[-1]))
-
     def add(self, first: int, blocks: Array) -> None:
         """Adds blocks (k, 6, 6) to the k off-diagonal blocks from index `first`, in the order given to `analyse`."""
         _add(self.symbolic, first, blocks, self.panels)

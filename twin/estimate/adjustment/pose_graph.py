@@ -147,7 +147,8 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
     """
     empty = np.empty(0, np.int64)
     i, j = np.concatenate([empty, *(f.i for f in graph.binary)]), np.concatenate([empty, *(f.j for f in graph.binary)])
-    matrix = block_cholesky.BlockMatrix.allocate(elimination.analyse(graph.n_poses, i, j))
+    symbolic = elimination.analyse(graph.n_poses, i, j)
+    matrix = block_cholesky.BlockMatrix(symbolic, np.empty(symbolic.offset[-1]))
     current, damping, converged = _evaluate(graph, start), 0.0, False
     while True:
         equations = _linearise(graph, current, matrix)

@@ -47,7 +47,8 @@ class ImageSpool:
         self._gray: OrderedDict[int, tuple[NDArray[np.float16], NDArray[np.float16]]] = OrderedDict()
 
     def __getstate__(self) -> dict[str, Any]:
-        self.flush()
+        if self._writing is not None:
+            self._writing.result()  # the next `flush` raises its error again
         return {"folder": self.folder, "binning": self.binning, "_hashes": self._hashes}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -65,9 +66,12 @@ class ImageSpool:
 
     def flush(self) -> None:
         """Waits until the last pair is written."""
-        if self._writing is not None:
-            writing, self._writing = self._writing, None
-            writing.result()
+        if (writing := self._writing) is not None:
+            try:
+                writing.result()
+            finally:
+                if self._writing is writing:  # other threads may have waited, too
+                    self._writing = None
 
     def close(self) -> None:
         """Waits until all pairs are written, ends the thread, frees the cache; an error of the last is not raised."""

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.special import chdtri
 
 from twin.core import geometry
-from twin.core.chi_square import chi2_quantile
 from twin.core.geometry import Array
 from twin.core.records import Map, StereoRig
 from twin.estimate.vision import matching
@@ -21,7 +21,7 @@ _LEAST_DISPARITY_PX = 0.5
 _CONFIDENCE, _ITERATIONS = 0.999, 500
 
 _SIGMAS = 3.0  # errors of the predicted positions up to this number of standard deviations are expected
-_CHI2 = chi2_quantile(0.9999, 6)  # largest chi-square of the difference between a measured and the predicted motion
+_CHI2 = chdtri(6, 1e-4)  # largest chi-square of the difference between a measured and the predicted motion
 
 
 def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig) -> bool:
