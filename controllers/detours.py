@@ -103,6 +103,8 @@ def _split(plan: SurveyPlan, at: _Break) -> SurveyPlan:
     path = plan.paths[at.track - 1]
     leg = path[at.n_segments - 1]
     assert isinstance(leg, Line)
+    if at.along_m > leg.profile.length_m - _LEAST_M / 2:  # the leg was split there
+        return plan
     x, y, z = (np.array(leg.start) + at.along_m * np.array(leg.direction)).tolist()
     before = leg._replace(profile=replace(leg.profile, length_m=at.along_m))
     after = leg._replace(start=(x, y, z), profile=replace(leg.profile, length_m=leg.profile.length_m - at.along_m))

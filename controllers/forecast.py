@@ -42,21 +42,15 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     keyframe_spacing_m = plan.n_frames_per_keyframe * plan.speed_mps / plan.request.frame_rate_hz
     return Forecast(
         n_frames_per_keyframe=plan.n_frames_per_keyframe,
-        keyframes_per_swath=max(1, round(plan.swath_length_m / keyframe_spacing_m)),
-        n_tracks=plan.n_tracks,
-        n_keyframes=int(keyframes.sum()),
-        n_frames=len(keyframes),
-        duration_s=sum(plan.track_duration_s(t) for t in tracks),
-        path_m=sum(plan.track_length_m(t) for t in tracks),
-        speed_mps=plan.speed_mps,
-        footprint_m=plan.request.footprint_m,
-        keyframe_spacing_m=keyframe_spacing_m,
-        swath_spacing_m=plan.swath_spacing_m,
-        overlap_along=max(0.0, 1 - keyframe_spacing_m / plan.side_along_m),
+        keyframes_per_swath=max(1, round(plan.swath_length_m / keyframe_spacing_m)), n_tracks=plan.n_tracks,
+        n_keyframes=int(keyframes.sum()), n_frames=len(keyframes),
+        duration_s=sum(plan.track_duration_s(t) for t in tracks), path_m=sum(plan.track_length_m(t) for t in tracks),
+        speed_mps=plan.speed_mps, footprint_m=plan.request.footprint_m, keyframe_spacing_m=keyframe_spacing_m,
+        swath_spacing_m=plan.swath_spacing_m, overlap_along=max(0.0, 1 - keyframe_spacing_m / plan.side_along_m),
         overlap_across=max(0.0, 1 - plan.swath_spacing_m / plan.side_across_m),
         disparity_px=plan.request.focal_px * baseline_m / plan.request.altitude_m,
         depth_sigma_m=plan.request.altitude_m**2 / (plan.request.focal_px * baseline_m) * disparity_sigma_px,
-    )
+    )  # fmt: skip
 
 
 class Clearance(NamedTuple):

@@ -94,7 +94,7 @@ class SurveyPlan:
         x_m, y_m = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         inside = self.area.contains(x_m, y_m)
         circles = [segment for path in self.paths for segment in path if isinstance(segment, Circle)]
-        if circles and self.n_tracks < self.n_tracks_to_fill:
+        if circles and self.n_leg_tracks < self.n_tracks_to_fill:
             return inside & self._near_loop(circles, x_m, y_m)
         if math.isinf(self.covered_to_m):
             return inside

@@ -71,6 +71,11 @@ def test_a_survey_returns_its_arrays_and_a_second_one_gets_its_own_folder(tmp_pa
     assert again.metrics == first.metrics and np.array_equal(again.errors_m, first.errors_m)
     assert twin.compare(first, second.folder)["runs"]
     assert twin.export(first, "tum")["tum"]
+    (first.folder / "trajectory_truth.tum").unlink()
+    unknown = twin.load_run(first.folder)
+    assert list(unknown.to_dataframe()) == ["time_s", *(f"{name}_{a}_m" for name in ("online", "final") for a in "xyz")]
+    with pytest.raises(TwinError, match="has no final or no true trajectory"):
+        _ = unknown.errors_m
 
 
 def test_a_plan_is_summarised_and_drawn(tmp_path):

@@ -80,6 +80,14 @@ def test_two_tasks_within_one_leg_are_flown_in_its_direction():
     assert set(before.swath) == set(after.swath)
 
 
+def test_two_tasks_that_leave_a_leg_at_the_same_place_are_flown_one_after_the_other():
+    tasks = [task(name=name, centre_m=(1.3, -0.9), within_leg=True) for name in "ab"]
+    survey = with_tasks(plan(REQUEST), tasks, HOLD_S)
+    starts = [positions(survey)[detour.track - 1][0] for detour in survey.detours]
+    np.testing.assert_allclose(starts[0], starts[1], atol=0.2)
+    assert len(survey.detours) == 2 and np.isfinite(survey.all_references().position).all()
+
+
 def test_several_tasks_keep_their_tracks_and_every_leg_keeps_its_number():
     tasks = [task(name="b", after_track=2), task(name="a", after_track=1), task(name="c", start_s=1e5)]
     level = plan(REQUEST)

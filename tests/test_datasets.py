@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import recorded_datasets as recorded
 from recorded_datasets import RIG
+from scipy.spatial.transform import Rotation
 
 from twin.app.outputs import new_folder, writing
 from twin.core import geometry
@@ -158,6 +159,16 @@ def raw_calibration(kind):
     return checked(StereoCalibration(*cameras, pose, Path("calibration.yaml")))
 
 
+@pytest.mark.parametrize("kind, whole", [("radtan", True), ("fisheye", False), ("double_sphere", True)])
+def test_a_fisheye_lens_without_coefficients_is_no_pinhole(kind, whole):
+    matrix = np.array([[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1.0]])
+    n = {"radtan": 5, "fisheye": 4, "double_sphere": 2}[kind]
+    pose = geometry.pose(np.eye(3), np.array([-0.1, 0.0, 0.0]))
+    camera = RecordedCamera((320, 240), matrix, np.zeros(n), kind)
+    found = rectification(checked(StereoCalibration(camera, camera, pose, Path("calibration.yaml"))), 10.0)
+    assert [one is None for one in found.maps] == [whole] * 2
+
+
 @pytest.mark.parametrize("kind", ["radtan", "fisheye"])
 def test_rectified_pixels_come_from_where_opencv_projects_their_points(kind):
     """The map at the rectified projection of a point is the projection of the point by the recorded lens."""
@@ -222,6 +233,15 @@ def test_a_truncated_image_is_not_used(tmp_path, suffix, reason):
     file.write_bytes(file.read_bytes()[: len(file.read_bytes()) // 2])
     with pytest.raises(UnreadableImage, match=reason):
         read_rgb(file, (RIG.width_px, RIG.height_px), ImageFormat())
+
+
+@pytest.mark.parametrize("after", [b"\0\0", b"\xff\xff", b"\r\n", b"SEFT"])
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_an_image_with_other_data_after_its_end_is_whole(tmp_path, suffix, after):
+    file = tmp_path / f"image.{suffix}"
+    cv2.imwrite(str(file), GRAY)
+    file.write_bytes(file.read_bytes() + after)
+    assert read_rgb(file, (RIG.width_px, RIG.height_px), ImageFormat()).shape[:2] == GRAY.shape
 
 
 def test_a_frame_that_cannot_be_used_is_skipped_and_counted(euroc):
@@ -453,11 +473,29 @@ def test_files_of_true_poses_are_told_apart(euroc, tmp_path):
         "1 2 3\n": "has 3 columns",
         "0 1 2 3 0 0 0 2\n": "not of unit length",
         "0 1 2 3 0 0 0 x\n": ":1: is not a line of numbers",
+        "1403636579763555584 1 2 3 0 0 0.5 0.8660254\n": "has the time 1403636579763555584 .*seconds, as in TUM",
     }
     for text, message in bad.items():
         (tmp_path / "bad.txt").write_text(text)
         with pytest.raises(TwinError, match=message):
             read_truth(tmp_path / "bad.txt", dataset)
+
+
+def test_poses_of_a_marker_become_those_of_the_camera_by_its_pose_in_the_body(euroc):
+    before, _ = read_dataset(euroc)
+    marker = geometry.exp(np.array([0.3, -1.2, 0.8, 0.07, -0.01, -0.12]))
+    folder = euroc / "mav0" / "vicon0"
+    (euroc / "mav0" / "state_groundtruth_estimate0").rename(folder)
+    body = before.truth.world_from_camera @ geometry.inverse(before.body_from_left)
+    quaternions = Rotation.from_matrix((body @ marker)[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    times_ns = np.round(before.truth.times_s * 1e9).astype(np.int64)
+    rows = [f"{t}," + ",".join(map(repr, [*p, *q])) for t, p, q in
+            zip(times_ns.tolist(), (body @ marker)[:, :3, 3].tolist(), quaternions.tolist(), strict=True)]  # fmt: skip
+    (folder / "data.csv").write_text("#\n" + "\n".join(rows))
+    values = ", ".join(map(repr, marker.ravel().tolist()))
+    (folder / "sensor.yaml").write_text(f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{values}]\n")
+    dataset, _ = read_dataset(euroc)
+    np.testing.assert_allclose(dataset.truth.world_from_camera, before.truth.world_from_camera, atol=1e-8)
 
 
 @pytest.mark.parametrize("missing", ["left", "right"])

@@ -17,6 +17,7 @@ from twin.core import geometry
 from twin.datasets.calibration import RecordedCamera, StereoCalibration
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.euroc import EurocReader
+from twin.datasets.text_files import read_yaml
 from twin.errors import TwinError
 from twin.recordings.rectification import rectification
 
@@ -511,3 +512,10 @@ def test_files_that_were_misread_are_read_or_refused(outside_data, name):
         assert re.search(CASES[name], str(error))
         return
     assert CASES[name] is None and (found.left.distortion.any() or size == (640, 480))
+
+
+def test_a_number_without_a_point_in_yaml_and_tabs_in_json_are_read(tmp_path):
+    (tmp_path / "sensor.yaml").write_text("gyroscope_noise_density: 2e-4\nmodel: 2e-4x\n")
+    assert read_yaml(tmp_path / "sensor.yaml") == {"gyroscope_noise_density": 2e-4, "model": "2e-4x"}
+    (tmp_path / "camera.json").write_text('{\n\t"a": {\n\t\t"b": [1e3, -2E-1]\n\t}\n}')
+    assert read_yaml(tmp_path / "camera.json") == {"a": {"b": [1000.0, -0.2]}}

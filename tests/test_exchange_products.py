@@ -12,9 +12,11 @@ import rasterio
 import trimesh
 from exported_run import GRID
 
+from twin.core import geometry
 from twin.core.georeference import Georeference
 from twin.core.ortho_tiles import OrthoTile
 from twin.core.records import MapGrid
+from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exports.formats import FORMATS
 from twin.report.run_folder import read_raster
@@ -89,6 +91,13 @@ def test_an_orthomosaic_of_a_georeferenced_run_keeps_its_crs(tmp_path):
         assert dem.bounds.left == pytest.approx(1000 - 1.0 * 3937 / 1200)
 
 
+def test_a_tilted_map_has_no_raster_in_a_crs(tmp_path):
+    tilted = replace(made.elevation(), map_from_world=geometry.exp(np.array([0.8, 0, 0, 0, 0, 0])))
+    with pytest.raises(TwinError, match="--to cog: the map is tilted"):
+        export("cog", made.contents(tmp_path, elevation=tilted, georeference=UTM), tmp_path / "out")
+    assert export("cog", made.contents(tmp_path, elevation=tilted), tmp_path / "local")
+
+
 @pytest.mark.parametrize("place", PLACES, ids=["local", "UTM"])
 def test_trimesh_reads_the_points_of_the_ply_file(run, place, tmp_path):
     (path,) = export("ply", replace(run, georeference=place), tmp_path / "out").values()
@@ -113,6 +122,7 @@ def test_laspy_reads_the_points_of_the_laz_file(run, place, tmp_path):
     np.testing.assert_allclose(read.xyz, points, atol=1e-6)
     np.testing.assert_array_equal(np.column_stack([read.red, read.green, read.blue]) // 257, colours)
     np.testing.assert_array_equal(read.sigma, sigma_m)
+    assert (np.asarray(read.return_number) == 1).all() and (np.asarray(read.number_of_returns) == 1).all()
     assert rasterio.crs.CRS.from_wkt(wkt) == (geotiff.LOCAL_METRES if place is None else "EPSG:32633")
 
 

@@ -127,3 +127,12 @@ def test_runs_that_cannot_be_compared_are_refused(tmp_path, runs):
     (folder / "metrics.json").unlink()
     with pytest.raises(TwinError, match="the survey is unfinished"):
         run_comparison.load_runs([folder, runs[1].folder])
+
+
+def test_scenarios_that_differ_late_in_a_long_list_differ(tmp_path):
+    runs = [write_run(tmp_path / name, 0.002, 0.9) for name in ("first", "second")]
+    for run, last in zip(runs, ("9.0", "9.5"), strict=True):
+        with (run / "scenario.resolved.toml").open("a") as file:
+            file.write(f"[other]\noutline_m = [{'0.123456789, ' * 12}{last}]\n")
+    differences = run_comparison.scenario_differences(run_comparison.load_runs(runs))
+    assert list(differences) == ["other.outline_m"] and all(len(text) == 80 for text in differences["other.outline_m"])

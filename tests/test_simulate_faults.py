@@ -195,6 +195,19 @@ def test_fish_move_and_have_the_parallax_of_their_distance():
     assert (given.images(blank, None)[0] == blank).all()
 
 
+def test_a_school_of_fish_stays_the_same_when_another_fault_ends():
+    blank = np.full((RIG.height_px, RIG.width_px, 3), 255, np.uint8)
+    school = {"part": "fish", "type": "school", "start_s": 0.0, "size": 3}
+    off = {"part": "pressure", "type": "off", "at_m": [0.0, 0.0], "radius_m": 9.0, "duration_s": 2.0}
+    seen = []
+    for given in (faults_of(off, school, seed=3), faults_of(school, seed=3)):
+        for time_s in (0.0, 1.9, 2.1):
+            given.at(time_s, HERE)
+            image = given.images(blank, None)[0]
+        seen.append(image)
+    np.testing.assert_array_equal(*seen)
+
+
 def test_a_fault_of_a_place_starts_when_the_camera_first_comes_there_and_only_then():
     faults = faults_of({"part": "pressure", "at_m": [1.0, 0.0], "radius_m": 0.3, "duration_s": 2.0})
     for time_s, x in enumerate((0.0, 0.6, 0.75, 1.0, 1.2, 1.5, 1.0, 0.0)):

@@ -18,7 +18,7 @@ from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.parameters import parameters_of
-from twin.simulate.sea import flow_at, make_sea, mean_current_mps
+from twin.simulate.sea import flow_at, gust_series, make_sea, mean_current_mps
 from twin.simulate.thrusters import steady_thrust_n
 from twin.simulate.waves import jonswap, peak_radps, wavenumbers
 
@@ -246,3 +246,9 @@ def test_mujoco_and_the_compiled_loop_move_alike_in_a_moving_sea():
         for body in (compiled, mujoco):
             body.step(command, 0.5)
     np.testing.assert_allclose(compiled.world_from_body, mujoco.world_from_body, atol=1e-8)
+
+
+def test_gusts_may_be_vertical_only():
+    current = CurrentConfig(gust_vertical_mps=0.3)
+    gusts = gust_series(current, np.random.default_rng(1))
+    assert not current.is_still and gusts[:, 2].std() == pytest.approx(0.3, rel=0.1) and not gusts[:, :2].any()

@@ -93,3 +93,44 @@ def test_invalid_beacons_are_reported_by_line_all_at_once(tmp_path, text, errors
     with pytest.raises(ScenarioError) as caught:
         prepare(load_scenario(file, flat))
     assert caught.value.lines == [f"{file}:{error}" for error in errors]
+
+
+FLAT = ["terrain.kind=flat", "terrain.relief_m=0", "terrain.size_m=[40,40]", "objects=[]", "imaging.fidelity=surrogate"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error"),
+    [
+        (
+            ["plan.area_m=[16,16]", "plan.altitude_m=8", "plan.overlap_across=0.3", "plan.speed_mps=0.73"],
+            "plan.speed_mps: .*up to 0.6",  # ahead 0.73 m/s, but sideways less
+        ),
+        (["waves.height_m=1", "waves.depth_m=3", "plan.altitude_m=5"], "waves.depth_m: 3: the cameras are above"),
+        (
+            ["terrain.base_m=5", "sun.depth_m=3", "plan.height=floor", "plan.altitude_m=2"],
+            "sun.depth_m: 3: the cameras are above the surface",
+        ),
+        (
+            ['tasks=[{name="t",after_track=1,position_m=[0,0],size_m=[15,15],altitude_m=2,cell_m=0.0015}]',
+             "plan.area_m=[16,16]", "plan.altitude_m=8", "plan.overlap_across=0.3", "plan.speed_mps=0.3"],
+            "map.cell_m",
+        ),
+        (["waves.fetch_m=1000", "sun.depth_m=30"], "waves.wind_mps: missing, as there is a waves.fetch_m"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_flown_is_refused(overrides, error):
+    with pytest.raises(ScenarioError, match=error):
+        prepare(load_scenario("reef", [*FLAT, *overrides]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_steep_floor_is_planned_or_refused(seed):
+    terrain = ["terrain.kind=fractal", "terrain.relief_m=10", "terrain.size_m=[12,12]", "terrain.grid_m=0.2"]
+    plan = ["plan.height=floor", "plan.altitude_m=2", "plan.area_m=[8,6]", "plan.overlap_along=0.5"]
+    with pytest.raises(ScenarioError):
+        prepare(load_scenario("reef", [*FLAT, *terrain, *plan, "plan.overlap_across=0.3", f"terrain.seed={seed}"]))
+
+
+def test_a_vehicle_without_drag_is_limited_by_no_speed():
+    drag = [f"vehicle.{kind}_drag=[0,0,0,0,0,0]" for kind in ("linear", "quadratic")]
+    assert prepare(load_scenario("reef", [*FLAT, *drag, "plan.area_m=[4,2]", "plan.tracks=1"])).n_frames > 0

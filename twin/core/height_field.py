@@ -215,7 +215,7 @@ def _share_seen(field, pose, camera, cell, x, y, z, depth):
     fx, fy, cx, cy, width, height = camera
     dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
     depth2 = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-    if depth2 <= 0:
+    if depth2 <= 0 or depth <= 0:
         return 0.0
     u = fx * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth2 + cx + 0.5
     v = fy * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth2 + cy + 0.5

@@ -54,25 +54,25 @@ class EurocReader:
         elif (root / _POSITIONS / "data.csv").is_file():
             notes = (f"The true positions ({_POSITIONS}) are not used: they have no attitude.",)
         return Dataset(
-            folder,
-            frames,
-            value_or_error(lambda: _calibration(root)),
-            truth,
-            n_right_only,
-            notes,
-            np.array([image.time_s for image in left]),
-            body_from_left,
+            folder, frames, value_or_error(lambda: _calibration(root)), truth, n_right_only, notes,
+            np.array([image.time_s for image in left]), body_from_left,
             None if body_from_left is None else value_or_error(lambda: read_folder(root, body_from_left)),
             None if file is None or not file.with_name(_TRUE_MAP).is_file() else file.with_name(_TRUE_MAP),
-        )
+        )  # fmt: skip
 
 
 def camera_truth(file: Path, body_from_left: Array) -> Trajectory:
-    """Returns camera poses from body poses (time [ns], x, y, z [m], qw, qx, qy, qz); raises TwinError if damaged."""
+    """Returns camera poses from those of body or marker (time [ns], x, y, z [m], qw, qx, qy, qz); TwinError if damaged.
+
+    The pose of the marker in the body is `T_BS` of sensor.yaml beside data.csv; without it, it is the body.
+    """
     rows = read_table(file, 8)
     body = trajectory_of(rows[:, 0] * 1e-9, rows[:, 1:4], rows[:, 4:8])
     if not len(rows) or body is None:
         raise TwinError(str(file), "is not a list of poses with unit quaternions", "timestamp, x, y, z, qw, qx, qy, qz")
+    marker = file.with_name("sensor.yaml")
+    if file.name == "data.csv" and marker.is_file() and "T_BS" in (tree := read_yaml(marker)):
+        body_from_left = geometry.inverse(rigid(pose_of(tree, "T_BS", marker), "T_BS", marker)) @ body_from_left
     return Trajectory(body.times_s, body.world_from_camera @ body_from_left)
 
 

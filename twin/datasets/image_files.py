@@ -19,7 +19,7 @@ Bayer = Literal["RGGB", "GRBG", "GBRG", "BGGR"]
 BAYER: tuple[Bayer, ...] = ("RGGB", "GRBG", "GBRG", "BGGR")
 _MOST_PIXELS = 2**28
 #: Bytes with which a complete file of a format ends (before padding with zeros).
-_ENDS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
+_PARTS = {"PNG": (b"IDAT", b"IEND\xaeB`\x82"), "JPEG": (b"\xff\xda", b"\xff\xd9")}  # pixels, and the end of an image
 _N_SAMPLES = 8  # number of images from which the number of used bits is determined
 
 
@@ -133,7 +133,7 @@ def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:
         raise UnreadableImage("another size")
     if width * height > _MOST_PIXELS:
         raise UnreadableImage(f"more than {_MOST_PIXELS} pixels")
-    if kind in _ENDS and not data.rstrip(b"\0").endswith(_ENDS[kind].rstrip(b"\0")):
+    if kind in _PARTS and data.rfind(_PARTS[kind][1]) < data.rfind(_PARTS[kind][0]):  # other data may follow the end
         raise UnreadableImage("truncated")
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

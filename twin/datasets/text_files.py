@@ -55,6 +55,9 @@ def _opencv_array(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     return data
 
 
+# without a decimal point, an exponent is text in YAML 1.1, but a number in JSON and YAML 1.2
+_exponent = re.compile(r"^[-+]?[0-9]+[eE][-+]?[0-9]+$")
+_CalibrationLoader.add_implicit_resolver("tag:yaml.org,2002:float", _exponent, [*"-+0123456789"])
 for _tag in ("tag:yaml.org,2002:opencv-", "!opencv-"):
     _CalibrationLoader.add_constructor(_tag + "matrix", _opencv_array)
     _CalibrationLoader.add_constructor(_tag + "nd-matrix", _opencv_array)
@@ -67,6 +70,7 @@ def read_text(file: Path, most_bytes: int = _MOST_BYTES) -> str:
 def read_yaml(file: Path) -> dict[str, Any]:
     """Returns the table in a YAML file, also of OpenCV; raises TwinError if it is missing, too large or not valid."""
     text = re.sub(r"\A%YAML[: ][^\n]*\n", "", read_text(file, _MOST_YAML_BYTES))
+    text = text.replace("\t", " ") if file.suffix.lower() == ".json" else text  # indented by tabs, which YAML is not
     try:
         tree = yaml.load(text, Loader=_CalibrationLoader)  # a SafeLoader: it builds plain values only
     except Exception as error:  # constructors of values raise any of many types

@@ -10,7 +10,7 @@ from twin.datasets import tum
 from twin.datasets.dataset import Dataset
 from twin.datasets.euroc import camera_truth
 from twin.datasets.kitti import camera_poses
-from twin.datasets.text_files import text_rows
+from twin.datasets.text_files import read_text, text_rows
 from twin.errors import TwinError
 from twin.exchange.geotiff import MOST_CELLS, read_raster
 from twin.judge.recorded import TrueMap
@@ -49,6 +49,8 @@ def read_truth(file: Path, dataset: Dataset) -> Trajectory:
             times_s = np.array([frame.time_s for frame in dataset.images])
         return camera_poses(file, times_s, dataset.body_from_left)
     if columns >= 8 and first.isdecimal() and len(first) >= 16:
+        if "," not in read_text(file):
+            raise TwinError(str(file), f"has the time {first}", "seconds, as in TUM, or commas, as in EuRoC")
         return camera_truth(file, np.eye(4) if dataset.body_from_left is None else dataset.body_from_left)
     if columns == 8:
         return tum.read_trajectory(file)

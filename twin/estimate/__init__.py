@@ -19,18 +19,9 @@ if TYPE_CHECKING:
     from twin.estimate.pipeline import Navigator
 
 __all__ = [
-    "ElevationMap",
-    "Estimate",
-    "EstimatorSettings",
-    "Frame",
-    "MapGrid",
-    "Navigator",
-    "Readings",
-    "SensorNoise",
-    "StereoRig",
-    "SurveyResult",
-    "Trajectory",
-]
+    "ElevationMap", "Estimate", "EstimatorSettings", "Frame", "MapGrid", "Navigator", "Readings", "SensorNoise",
+    "StereoRig", "SurveyResult", "Trajectory",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

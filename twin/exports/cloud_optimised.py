@@ -8,12 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import rasterio
 import rasterio.shutil
 
 from twin.core.georeference import Georeference
 from twin.core.user_files import open_raster
 from twin.datasets.run_contents import RunContents
+from twin.errors import TwinError
 from twin.exchange import geotiff
 
 _OPTIONS = {"compress": "DEFLATE", "bigtiff": "IF_SAFER"}
@@ -28,6 +30,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     """
     elevation, origin = contents.elevation, contents.georeference
     assert elevation is not None  # by `ExportFormat.needs`
+    if origin is not None and not np.allclose(elevation.map_from_world, np.eye(4)):
+        raise TwinError("--to cog", "the map is tilted and has no place in a CRS", "ply or laz, or no --crs")
     layers = {
         "dem.tif": (geotiff.write_elevations, elevation.height_m, "elevation [m]"),
         "dem_sigma.tif": (geotiff.write_layer, elevation.sigma_m, "standard deviation [m]"),

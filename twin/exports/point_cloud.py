@@ -83,5 +83,6 @@ def export_laz(contents: RunContents, folder: Path) -> list[Path]:
     colours = cloud.colours.astype(np.uint16) * _EIGHT_TO_SIXTEEN_BITS
     cloud_file.red, cloud_file.green, cloud_file.blue = colours.T
     cloud_file.sigma = cloud.sigma_m
+    cloud_file.return_number = cloud_file.number_of_returns = np.ones(len(cloud.points), np.uint8)
     cloud_file.write(str(path))
     return [path]

@@ -67,29 +67,22 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
     assert energy.survey_wh is not None and energy.dives is not None  # a rigid vehicle
     rest, cruise = electrical_power_w(vehicle, np.array([np.zeros(3), speed_mps * ahead]))
     return VehicleLimits(
-        title=vehicle.title,
-        voltage_v=vehicle.voltage_v,
-        controller=mission.scenario.control.plugin or "built in",
+        title=vehicle.title, voltage_v=vehicle.voltage_v, controller=mission.scenario.control.plugin or "built in",
         buoyancy_n=hull.buoyancy_n - hull.weight_n,
         righting_nm_per_deg=math.radians(hull.buoyancy_n * float(hull.centre_of_buoyancy_m[2])),
         speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in axes.items()},
         forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in axes.items()},
-        current_mps=np.nan if fins else largest_current_mps(mission),
-        speed_mps=speed_mps,
+        current_mps=np.nan if fins else largest_current_mps(mission), speed_mps=speed_mps,
         load=float(thrust_loads(vehicle, through_water, pulls).max()),
         stopping_m=speed_mps * thruster_lag_s(vehicle)
         + stopping_distance_m(vehicle, speed_mps, full_force_n(vehicle, ahead), 0.0),
-        coasting_m=stopping_distance_m(vehicle, speed_mps, 0.0, 0.1 * speed_mps),
-        latency_s=largest_latency_s(mission),
-        hover_h=np.nan if fins else usable_wh(vehicle) / rest,
-        cruise_h=usable_wh(vehicle) / cruise,
-        survey_s=len(through_water) / mission.rig.frame_rate_hz,
-        survey_wh=energy.survey_wh,
-        dives=energy.dives,
+        coasting_m=stopping_distance_m(vehicle, speed_mps, 0.0, 0.1 * speed_mps), latency_s=largest_latency_s(mission),
+        hover_h=np.nan if fins else usable_wh(vehicle) / rest, cruise_h=usable_wh(vehicle) / cruise,
+        survey_s=len(through_water) / mission.rig.frame_rate_hz, survey_wh=energy.survey_wh, dives=energy.dives,
         minimum_speed_mps=minimum_speed_mps(vehicle) if fins else 0.0,
         turning_radius_m=turning_radius_m(vehicle, speed_mps) if fins else 0.0,
         full_rudder_radius_m=turning_radius_m(vehicle, speed_mps, share=1.0) if fins else 0.0,
-    )
+    )  # fmt: skip
 
 
 def largest_current_mps(mission: Mission) -> float:

@@ -129,21 +129,17 @@ def is_rectified(calibration: StereoCalibration) -> bool:
     parallel = np.linalg.norm(geometry.so3_log(calibration.right_from_left[:3, :3])) < _PARALLEL_RAD
     aligned = float(np.abs(offset[1:]).max()) <= _ACROSS * calibration.baseline_m
     equal = np.abs(left.matrix - right.matrix)[[0, 1, 1], [0, 1, 2]].max() < _EQUAL_PX
-    return bool(parallel and aligned and equal and not left.distortion.any() and not right.distortion.any())
+    bent = any(camera.distortion.any() or camera.kind == "fisheye" for camera in (left, right))
+    return bool(parallel and aligned and equal and not bent)
 
 
 def _rig(matrix: Array, calibration: StereoCalibration, size_px: tuple[int, int], frame_rate_hz: float) -> StereoRig:
     return StereoRig(
-        width_px=size_px[0],
-        height_px=size_px[1],
-        focal_px=float(matrix[0, 0]),
-        baseline_m=calibration.baseline_m,
-        frame_rate_hz=frame_rate_hz,
-        focal_y_px=None if matrix[0, 0] == matrix[1, 1] else float(matrix[1, 1]),
+        width_px=size_px[0], height_px=size_px[1], focal_px=float(matrix[0, 0]), baseline_m=calibration.baseline_m,
+        frame_rate_hz=frame_rate_hz, focal_y_px=None if matrix[0, 0] == matrix[1, 1] else float(matrix[1, 1]),
         principal_point_px=(float(matrix[0, 2]), float(matrix[1, 2])),
-        yaw_sigma_rad=math.radians(calibration.rotation_sigma_deg),
-        baseline_sigma=calibration.baseline_sigma,
-    )
+        yaw_sigma_rad=math.radians(calibration.rotation_sigma_deg), baseline_sigma=calibration.baseline_sigma,
+    )  # fmt: skip
 
 
 def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> Positions:

@@ -101,8 +101,8 @@ def scenario_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
     """Returns the keys of the scenario in which the runs differ, with the value in every run as JSON, or a dash."""
     flat = [dict(_leaves(run.scenario)) for run in runs]
     keys = sorted(set().union(*flat))
-    texts = {key: [_json(one[key]) if key in one else DASH for one in flat] for key in keys}
-    return {key: values for key, values in texts.items() if len(set(values)) > 1}
+    texts = {key: [json.dumps(one[key], default=str) if key in one else DASH for one in flat] for key in keys}
+    return {key: [_shortened(one) for one in values] for key, values in texts.items() if len(set(values)) > 1}
 
 
 def as_json(runs: Sequence[Run]) -> dict[str, Any]:
@@ -242,6 +242,5 @@ def _leaves(scenario: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield key, value
 
 
-def _json(value: Any) -> str:
-    text = json.dumps(value, default=str)
+def _shortened(text: str) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -79,18 +79,22 @@ class RunResult:
     @property
     def errors_m(self) -> NDArray[np.float64]:
         """Returns the errors (n, 3) [m] of the final camera positions in the world, for the frames of the survey."""
+        if not {"final", "truth"} <= self.trajectories.keys():
+            raise TwinError(str(self.folder), "has no final or no true trajectory", "a run with both")
         final, truth = self.trajectories["final"], self.trajectories["truth"]
         rows = np.searchsorted(truth.times_s, final.times_s)
         return final.positions - truth.positions[np.minimum(rows, len(truth) - 1)]
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """Returns time, true, online, final positions, final error [m] by frame; raises TwinError without pandas."""
+        """Returns time, true, online, final positions, final error [m] by frame, as known; TwinError without pandas."""
         pandas = optional("pandas", "notebook", "to_dataframe")
-        table = pandas.DataFrame({"time_s": self.trajectories["final"].times_s})
-        for name in ("truth", "online", "final"):
-            for axis, values in zip("xyz", self.trajectories[name].positions.T, strict=True):
+        paths = {name: self.trajectories[name] for name in ("final", "online", "truth") if name in self.trajectories}
+        table = pandas.DataFrame({"time_s": next((path.times_s for path in paths.values()), np.zeros(0))})
+        for name in reversed(paths):
+            for axis, values in zip("xyz", paths[name].positions.T, strict=True):
                 table[f"{name}_{axis}_m"] = pandas.Series(values)
-        table["error_m"] = np.linalg.norm(self.errors_m, axis=1)
+        if {"final", "truth"} <= paths.keys():
+            table["error_m"] = np.linalg.norm(self.errors_m, axis=1)
         return table
 
     def _repr_html_(self) -> str:
@@ -100,5 +104,6 @@ class RunResult:
         warnings = "".join(f"<li>{escape(text)}</li>" for text in self.metrics.get("warnings", ()))
         report = (self.folder / "report.html").absolute()
         link = f'<a href="{report.as_uri()}">report</a>' if report.exists() else ""
-        title = f"{escape(self.metrics['name'])}, seed {self.metrics['seed']}: {self.status}"
+        seed = "" if self.metrics["seed"] is None else f", seed {self.metrics['seed']}"
+        title = f"{escape(self.metrics['name'])}{seed}: {self.status}"
         return f"<b>{title}</b> {link}<table>{rows}</table><ul>{warnings}</ul>"

@@ -44,6 +44,7 @@ def _absent_in_water(scenario: Scenario) -> dict[str, bool]:
         "no multiple scattering": not clear and scenario.imaging.scattering == "single",
         "no marine snow": scenario.snow.density_per_m3 == 0,
         "no current": scenario.current.is_still,
-        "no gusts": not scenario.current.is_still and scenario.current.gust_mps == 0,
+        "no gusts": not scenario.current.is_still
+        and not (scenario.current.gust_mps or scenario.current.gust_vertical_mps),
         "no waves": scenario.waves.is_calm,
     }

@@ -765,7 +765,9 @@ class CurrentConfig(Section):
     @property
     def is_still(self) -> bool:
         """Returns whether the water does not move, apart from waves."""
-        return self.file is None and not (any(self.velocity_mps) or self.gust_mps or any(self.tide_mps))
+        return self.file is None and not any(
+            (*self.velocity_mps, *self.tide_mps, self.gust_mps, self.gust_vertical_mps)
+        )
 
 
 class WavesConfig(Section):
@@ -1305,18 +1307,13 @@ class Scenario(Section):
     def believed_noise(self) -> SensorNoise:
         navigation, rate_hz = self.navigation, self.navigation.dvl_rate_hz
         return SensorNoise(
-            navigation.pressure_sigma_m,
-            float(np.deg2rad(navigation.attitude_sigma_deg)),
-            float(np.deg2rad(navigation.heading_sigma_deg)),
-            navigation.dvl_sigma_mps,
-            navigation.dvl_scale_sigma,
-            navigation.usbl_sigma_m,
-            navigation.beacon_sigma_px,
-            tuple(beacon.position_m for beacon in self.beacons),
+            navigation.pressure_sigma_m, float(np.deg2rad(navigation.attitude_sigma_deg)),
+            float(np.deg2rad(navigation.heading_sigma_deg)), navigation.dvl_sigma_mps, navigation.dvl_scale_sigma,
+            navigation.usbl_sigma_m, navigation.beacon_sigma_px, tuple(beacon.position_m for beacon in self.beacons),
             imu=self._imu_noise() if "imu" in navigation.aiding else None,
             pressure_resolution_m=navigation.pressure_resolution_m,
             dvl_interval_s=0.0 if rate_hz is None or rate_hz >= self.rig.frame_rate_hz else 1 / rate_hz,
-        )
+        )  # fmt: skip
 
     def _imu_noise(self) -> ImuErrorModel | None:
         imu = self.imu

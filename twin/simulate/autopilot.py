@@ -49,7 +49,7 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     coefficients = zip(thrusts_from_force @ quadratic, thrusts_from_force @ linear, strict=True)
     roots = np.concatenate([np.roots([q, p, sign * full_n]) for q, p in coefficients for sign in (-1, 1)])
     real = roots[np.isreal(roots)].real
-    return float(real[real > 0].min())
+    return float(real[real > 0].min(initial=np.inf))
 
 
 def thrust_loads(vehicle: VehicleConfig, velocities: Array, pulls: Array | float = 0.0) -> Array:

@@ -52,7 +52,7 @@ class Faults:
         self._gusts = [fault for fault in faults if fault.type == "gust"]
         self._active: list[FaultConfig] = []
         self._all = list(faults)
-        self._kept: dict[tuple[int, object], Any] = {}  # by fault and kind of data: what a stuck part repeats
+        self._kept: dict[tuple[object, object], Any] = {}  # by fault and kind of data: what a stuck part repeats
         self.events: list[FaultEvent] = []
         self.exist = bool(faults)
 
@@ -140,7 +140,7 @@ class Faults:
                 if share > _LEAST_SILT:
                     seen = [image if image is None else behind_silt(image, share, self._rng) for image in seen]
             elif fault.part == "fish" and 0 <= since_s < end_s - start_s:
-                school = self._kept.setdefault((n, "school"), new_school(max(1, round(fault.size)), self._rng))
+                school = self._kept.setdefault(("school", n), new_school(max(1, round(fault.size)), self._rng))
                 seen = [
                     image if image is None else behind_fish(image, school, since_s, k, self._rig, self._floor_m)
                     for k, image in enumerate(seen)

@@ -38,20 +38,17 @@ def parameters_of(vehicle: VehicleConfig) -> VehicleParameters:
     if vehicle.voltage_v is not None:
         table = thrust_and_power(vehicle, vehicle.voltage_v)[:2]
     return VehicleParameters(
-        mass_kg=vehicle.mass_kg,
-        inertia_kgm2=np.array(vehicle.inertia_kgm2),
+        mass_kg=vehicle.mass_kg, inertia_kgm2=np.array(vehicle.inertia_kgm2),
         centre_of_buoyancy_m=np.array(vehicle.centre_of_buoyancy_m, float),
         added_mass=_matrix(vehicle.added_mass, vehicle.added_mass_matrix),
         linear_drag=_matrix(vehicle.linear_drag, vehicle.linear_drag_matrix),
         quadratic_drag=_matrix(vehicle.quadratic_drag, vehicle.quadratic_drag_matrix),
         drag_centre_m=np.array(vehicle.drag_centre_m, float),
         thrust_configuration=np.vstack([directions.T, np.cross(positions, directions).T]),
-        thrust_coefficients=np.array(vehicle.thrust_coefficients, float),
-        thrust_table=table.copy(),
+        thrust_coefficients=np.array(vehicle.thrust_coefficients, float), thrust_table=table.copy(),
         thruster_lag=(numerator / denominator[0], denominator / denominator[0]),
-        half_size_m=np.array(vehicle.size_m) / 2,
-        hull_centre_m=np.array(vehicle.hull_centre_m, float),
-    )
+        half_size_m=np.array(vehicle.size_m) / 2, hull_centre_m=np.array(vehicle.hull_centre_m, float),
+    )  # fmt: skip
 
 
 def thrust_and_power(vehicle: VehicleConfig, voltage_v: float) -> Array:

@@ -139,7 +139,7 @@ def gust_series(current: CurrentConfig, rng: np.random.Generator | None) -> Arra
     """Returns velocities (n, 3) of the gusts [m/s] every `GUST_INTERVAL_S`, periodic; (0, 3) without gusts."""
     # The covariance of the values is exact: the circulant matrix of the covariances of the period has the eigenvalues
     # with which white noise is weighted (Davies & Harte 1987, Biometrika 74, 95).
-    if rng is None or current.gust_mps == 0:
+    if rng is None or not (current.gust_mps or current.gust_vertical_mps):
         return np.zeros((0, 3))
     vertical = current.gust_vertical_mps
     sigma = np.array([1.0, 1.0, _VERTICAL]) * current.gust_mps

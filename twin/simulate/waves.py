@@ -35,7 +35,7 @@ def wave_components(waves: WavesConfig, sun_depth_m: float, rng: np.random.Gener
     the depth is missing, fetch or wind is missing, or the waves would break.
     """
     depth_m = waves.depth_m or sun_depth_m
-    if not waves.is_calm:
+    if not waves.is_calm or waves.fetch_m is not None:
         _check(waves, depth_m)
     if waves.is_calm or rng is None:
         return CALM

@@ -38,6 +38,7 @@ from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
 from twin.world.pace import SAME_TIME_S, Pace
 from twin.world.path_checks import (
+    check_below_surface,
     check_floor_below,
     check_lamp,
     check_objects,
@@ -253,9 +254,13 @@ def prepare(scenario: Scenario) -> Mission:
         raise ScenarioError(errors.lines)
     assert terrain is not None and chart is not None and plan is not None and grid is not None
     assert true_cameras is not None and illumination is not None
-    return Mission(
-        scenario, terrain, chart, plan, scenario.believed_rig(), grid, true_cameras, illumination, objects, mesh_floor
-    )
+    rig = scenario.believed_rig()
+    mission = Mission(scenario, terrain, chart, plan, rig, grid, true_cameras, illumination, objects, mesh_floor)
+    for detail in mission.details:
+        errors.attempt(check_map_size, detail.grid)
+    if errors.lines:
+        raise ScenarioError(errors.lines)
+    return mission
 
 
 def _load_floor(scenario: Scenario) -> tuple[terrains.Terrain, MeshFloor | None]:
@@ -299,6 +304,7 @@ def _check_path(
     scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan, objects: tuple[PlacedObject, ...], errors: _Errors
 ) -> None:
     errors.attempt(check_floor_below, scenario.plan, terrain, plan)
+    errors.attempt(check_below_surface, scenario, plan)
     errors.attempt(check_objects, objects, plan, scenario.plan.clearance_m)
     errors.attempt(check_tasks, scenario, plan, terrain)
     errors.attempt(check_computer, scenario, plan)

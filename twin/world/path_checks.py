@@ -202,6 +202,15 @@ def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m
             )
 
 
+def check_below_surface(scenario: Scenario, plan: SurveyPlan) -> None:
+    """Raises TwinError if the cameras reach the surface of a sea with daylight from above it or with waves."""
+    highest_m, waves = float(plan.all_references().position[:, 2].max()), scenario.waves
+    depths = {"sun.depth_m": scenario.sun.depth_m, "waves.depth_m": None if waves.is_calm else waves.depth_m}
+    for key, depth_m in depths.items():
+        if depth_m and highest_m >= depth_m:
+            raise TwinError(key, f"{depth_m:g}: the cameras are above the surface", f"more than {highest_m:.2f}")
+
+
 def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain, plan: SurveyPlan) -> None:
     """Raises TwinError if a lamp, at a position (3,) in the body, is below the floor on the path at any heading."""
     corners = plan.outline()
@@ -236,8 +245,8 @@ def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan, tether: Tet
     """Raises TwinError if a thruster saturates: to hold station in the current, or at the planned velocities in it.
 
     The current is its mean with the strongest tide, at the heights of the path; gusts and waves are shorter. Also
-    raises TwinError if a file of the current does not cover times and heights of the path. A kinematic vehicle, and a
-    path at constant height without current and tether, are not checked; of a vehicle with fins, only the speed is.
+    raises TwinError if a file of the current does not cover times and heights of the path. A kinematic vehicle is not
+    checked; of a vehicle with fins, only the speed is.
     """
     if vehicle.dynamics == "kinematic":
         return
@@ -252,7 +261,7 @@ def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan, tether: Tet
         if vehicle.is_steered_by_fins:
             if current.any():
                 _check_speed_through(vehicle, current, velocity)
-        elif current.any() or plan.follows_floor or plan.request.cross_rise_m or tether.length_m:
+        else:
 
             def load(current: Array, velocity: Array) -> float:
                 pulls = steady_pulls(tether, current, position, yaw, velocity)

@@ -61,8 +61,8 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     if scenario.plan.height == "floor" or scenario.control.height != "planned":
         request = request._replace(surface=_surface(scenario, request, plan.area, terrain))
         plan = _PATTERNS[pattern](request)
-    x, y, z = plan.outline().T
-    if scenario.plan.overlap_reference == "floor" and (terrain.height_at(x, y) < z).all():
+    x, y, z = plan.all_references().position.T
+    if scenario.plan.overlap_reference == "floor" and not (terrain.height_at(x, y) >= z).any():
         plan = _over_floor(plan, pattern, terrain, scenario.believed_rig())
         check_plan_size(plan, scenario.control.hold_s)
     return _with_tasks(scenario, plan, terrain)
