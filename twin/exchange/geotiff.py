@@ -128,7 +128,7 @@ def _created(path: Path, layout: dict[str, Any]) -> Iterator[Any]:
 def check_written(path: Path) -> None:
     """Raises OSError if a file that was written is cut: on a full disk, GDAL ignores that the last writes failed."""
     whole = False
-    with suppress(RasterioIOError), rasterio.open(path) as file:
+    with suppress(RasterioIOError), rasterio.open(path, driver="GTiff") as file:
         (rows, cols), n_bytes = file.block_shapes[0], path.stat().st_size
         blocks = product(range(-(-file.width // cols)), range(-(-file.height // rows)))
         items = ([file.get_tag_item(f"BLOCK_{k}_{c}_{r}", "TIFF", 1) for k in ("OFFSET", "SIZE")] for c, r in blocks)

@@ -268,8 +268,7 @@ def _goal_rules(study: Study) -> Iterator[Rule]:
     for name in study.compare:
         problem = f"{name} can be negative, but the ratio of its medians is compared"
         yield name in SIGNED, "compare", problem, "metrics that are never negative, such as map.rmse_m"
-    listed = {*map(repr, fidelity.grid or ())} if fidelity is not None else set()
-    has_both = listed == {*map(repr, FIDELITIES)}
+    has_both = fidelity is not None and {*map(repr, fidelity.grid or ())} == {*map(repr, FIDELITIES)}
     single, allowed = bool(study.compare) and not has_both, "vary.imaging.fidelity with a grid of both"
     yield single, "compare", "needs surveys of both fidelities", allowed
     varies = study.tune is not None and FIDELITY in {*study.varied_keys, *study.tune.search}

@@ -204,8 +204,9 @@ def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m
 
 def check_below_surface(scenario: Scenario, plan: SurveyPlan) -> None:
     """Raises TwinError if the cameras reach the surface of a sea with daylight from above it or with waves."""
-    highest_m, waves = float(plan.all_references().position[:, 2].max()), scenario.waves
-    depths = {"sun.depth_m": scenario.sun.depth_m, "waves.depth_m": None if waves.is_calm else waves.depth_m}
+    highest_m, sun, waves = float(plan.all_references().position[:, 2].max()), scenario.sun, scenario.waves
+    lit_m = sun.depth_m * (scenario.plan.altitude_m < sun.depth_m)  # otherwise the light is refused
+    depths = {"sun.depth_m": lit_m, "waves.depth_m": 0.0 if waves.is_calm else waves.depth_m}
     for key, depth_m in depths.items():
         if depth_m and highest_m >= depth_m:
             raise TwinError(key, f"{depth_m:g}: the cameras are above the surface", f"more than {highest_m:.2f}")
