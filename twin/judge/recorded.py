@@ -57,7 +57,7 @@ def associate(estimated_s: Array, true_s: Array) -> Associated:
     """Associates the poses of two trajectories by time as evo does (`evo.core.sync.associate_trajectories`).
 
     Each pose of the shorter trajectory goes with the nearest of the longer one, at times (n,) and (m,) [s] that differ
-    by at most `MAX_DIFFERENCE_S`; unlike there, of several with the same one, only the closest goes with it.
+    by at most `MAX_DIFFERENCE_S`; unlike there, of several true poses of a frame, only the closest goes with it.
     """
     truth_longer = len(true_s) > len(estimated_s)
     short, long = (estimated_s, true_s) if truth_longer else (true_s, estimated_s)
@@ -66,8 +66,8 @@ def associate(estimated_s: Array, true_s: Array) -> Associated:
     order = np.argsort(long, kind="stable")
     nearest = order[nearest_index(long[order], short)]
     differences = np.abs(long[nearest] - short)
-    closest = np.argsort(differences, kind="stable")
-    kept = np.sort(closest[np.unique(nearest[closest], return_index=True)[1]])
+    frames, closest = np.arange(len(short)) if truth_longer else nearest, np.argsort(differences, kind="stable")
+    kept = np.sort(closest[np.unique(frames[closest], return_index=True)[1]])
     kept = kept[differences[kept] <= MAX_DIFFERENCE_S]
     return Associated(kept, nearest[kept]) if truth_longer else Associated(nearest[kept], kept)
 
