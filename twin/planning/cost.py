@@ -36,10 +36,10 @@ class _Coefficients(NamedTuple):
 _RENDERED_S = _Coefficients(start=9.7, frame=0.0087, frame_mpx=0.221, keyframe=0.07, keyframe_mpx=3.0)
 _OBJECTS_S = _Coefficients(start=4.0, frame=0.022)  # in addition, with objects in the images
 _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
-_RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=4.2)
-_DISPARITY_MB_PER_MPX = 4.0  # of one keyframe: two numbers of 16 bits a pixel
+_RENDERED_DISK_MB = _Coefficients(start=6.0, keyframe=0.033)  # without images
+_PAIR_MB_PER_MPX, _DISPARITY_MB_PER_MPX = 4.2, 4.0  # of the images of a frame; of a keyframe, in 16-bit numbers
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
-_RENDERED_MB = _Coefficients(start=555.0, frame=0.006, keyframe_mpx=7.0)
+_RENDERED_MB = _Coefficients(start=555.0, frame=0.0045, keyframe_mpx=2.0)  # depths in half precision
 _IMAGES_MB_PER_MPX = 500.0
 _SURROGATE_MB = _Coefficients(start=507.0, frame=0.006)
 _REPORT_MB = 180.0  #: part of `start` of report and recording
@@ -55,13 +55,13 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
     if mission.scenario.imaging.fidelity == "surrogate":
         disk_mb = _SURROGATE_DISK_MB.total(*size)
         return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB.total(*size), disk_mb, disk_mb)
-    window_tracks = mission.scenario.estimator_settings().window_tracks
-    window = round(n_keyframes * min(1.0, (window_tracks + 1) / len(mission.tracks)))
-    memory_mb = _RENDERED_MB.total(mission.n_frames, window, megapixels) + _IMAGES_MB_PER_MPX * megapixels
+    share = min(1.0, (mission.scenario.estimator_settings().window_tracks + 1) / len(mission.tracks))
+    memory_mb = _RENDERED_MB.total(mission.n_frames, round(share * n_keyframes), megapixels) + _floor_mb(mission)
     time_s = _RENDERED_S.total(*size) + (_OBJECTS_S.total(*size) if mission.objects else 0.0)
-    disk_mb = _RENDERED_DISK_MB.total(*size)
-    flight_disk_mb = disk_mb + n_keyframes * megapixels * _DISPARITY_MB_PER_MPX
-    return ComputingCost(time_s, memory_mb + _floor_mb(mission), disk_mb, flight_disk_mb)
+    n_kept = {"none": 0, "keyframes": n_keyframes, "all": mission.n_frames + n_keyframes}[mission.scenario.record]
+    disk_mb = _RENDERED_DISK_MB.total(*size) + n_kept * megapixels * _PAIR_MB_PER_MPX
+    until_end_mb = n_keyframes * megapixels * (_DISPARITY_MB_PER_MPX + _PAIR_MB_PER_MPX * (n_kept == 0))
+    return ComputingCost(time_s, memory_mb + _IMAGES_MB_PER_MPX * megapixels, disk_mb, disk_mb + until_end_mb)
 
 
 def _floor_mb(mission: Mission) -> float:
