@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.controllers import lawnmower, loops
+from twin.controllers.detours import Task, with_tasks
 from twin.controllers.survey_plan import SurveyRequest
 from twin.scenario.file import load_scenario
 from twin.world.mission import prepare
@@ -58,6 +59,13 @@ def test_the_first_loops_cover_a_ring_along_each_loop(tracks):
     differs = expected != plan.inside_area(*points.T)
     assert (np.abs(distance_m[differs] - plan.swath_spacing_m / 2) < 0.01).all()  # spacing of the path's points
     assert expected.sum() > 20
+
+
+def test_a_part_of_the_loops_remains_a_part_with_many_tasks():
+    part = loops.plan(ROUND._replace(tracks=2))
+    task = Task("coral", (0.5, -0.3), (0.8, 0.6), 1.0, 0.0, 0.1, 0.9, 0.8, after_track=1)
+    tasks = [task._replace(name=str(k)) for k in range(part.n_tracks_to_fill)]
+    assert share_inside(with_tasks(part, tasks, 2.0), 3.5) == share_inside(part, 3.5) < np.pi * 8
 
 
 def test_points_of_any_shape_are_accepted():
