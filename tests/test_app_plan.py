@@ -192,7 +192,7 @@ print(time.process_time(), open('/proc/self/status').read().split('VmHWM:')[1].s
 
 
 def test_memory_and_disk_of_the_whole_mission_are_those_measured():
-    """Measured once, in 84 minutes: 1151 MB; 176 MB without images, 3730 MB until the end (`docs/findings.md`)."""
+    """Measured once, in 84 minutes: 1151 MB of memory; 176 MB of disk without images, 3730 MB until the end."""
     small = ["rig.image_width_px=320", "rig.image_height_px=240"]
     costs = [
         computing_cost(prepare(load_scenario("paper", [*small, f"record={one}"])), 5693)

@@ -64,7 +64,7 @@ class EurocReader:
 def camera_truth(file: Path, body_from_left: Array) -> Trajectory:
     """Returns camera poses from those of body or marker (time [ns], x, y, z [m], qw, qx, qy, qz); TwinError if damaged.
 
-    The pose of the marker in the body is `T_BS` of sensor.yaml beside data.csv; without it, it is the body.
+    The pose of the marker in the body is `T_BS` of sensor.yaml next to data.csv; without it, it is the body.
     """
     rows = read_table(file, 8)
     body = trajectory_of(rows[:, 0] * 1e-9, rows[:, 1:4], rows[:, 4:8])
