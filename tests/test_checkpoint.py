@@ -20,7 +20,7 @@ from twin.core.interrupts import StageGuard
 from twin.core.records import Frame
 from twin.core.series import GrowingArray
 from twin.errors import TwinError
-from twin.estimate.vision.disparity import Disparity
+from twin.estimate.vision.disparity import DenseMatch, Disparity
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.tiles import TiledRaster
 from twin.report.frame_recorder import FrameRecorder
@@ -308,7 +308,8 @@ def test_a_finished_run_that_is_resumed_loses_what_only_a_run_in_progress_has(fi
 @pytest.mark.parametrize("length", [0, 100])
 def test_a_disparity_that_a_full_disk_cut_is_a_read_error(tmp_path, length):
     spool, image = ImageSpool(tmp_path), np.zeros((8, 8, 3), np.uint8)
-    spool.put(3, image, image, (image[..., 0], image[..., 0]), Disparity(*np.ones((2, 8, 8), np.float32)))
+    ones = np.ones((8, 8), np.float32)
+    spool.put(3, image, image, (image[..., 0], image[..., 0]), DenseMatch(ones, Disparity(ones, ones)))
     file = tmp_path / "000003_disparity.npy"
     spool.disparity(3)
     file.write_bytes(file.read_bytes()[:length])

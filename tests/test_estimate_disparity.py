@@ -159,11 +159,22 @@ def test_the_search_range_contains_all_disparities_of_a_scene_and_is_the_widest_
     assert disparity.search_range(left, right) == (0, int(0.4 * 320))
 
 
-def test_a_packed_disparity_is_that_which_was_packed(slanted):
-    result, _ = slanted
-    unpacked = disparity.Disparity.unpacked(result.packed())
-    np.testing.assert_allclose(unpacked.disparity_px, result.disparity_px, atol=0.002)
-    np.testing.assert_allclose(unpacked.sigma_px, result.sigma_px, rtol=1e-3)
+def test_a_packed_match_has_the_disparities_and_sigmas_that_were_packed(slanted):
+    fine, _ = slanted
+    coarse = np.where(np.isnan(fine.disparity_px), np.float32(7.25), np.float32(np.nan))
+    coarse[:20] = np.nan
+    match = disparity.DenseMatch(coarse, fine)
+    unpacked = disparity.DenseMatch.unpacked(match.packed())
+    np.testing.assert_allclose(unpacked.fine.disparity_px, fine.disparity_px, atol=0.002)
+    np.testing.assert_allclose(unpacked.fine.sigma_px, fine.sigma_px, rtol=1e-3)
+    np.testing.assert_allclose(unpacked.best_px, match.best_px, atol=0.002)
+
+
+def test_the_largest_disparity_that_can_be_found_is_packed_without_overflow():
+    """At 341 px, the search up to 136 px has 144 disparities, as their number is a multiple of 16."""
+    found = np.full((4, 341), 143.9, np.float32)
+    match = disparity.DenseMatch(found, disparity.Disparity(found, np.full_like(found, 0.1)))
+    np.testing.assert_allclose(disparity.DenseMatch.unpacked(match.packed()).fine.disparity_px, 143.9, atol=0.002)
 
 
 def test_the_stereo_geometry_is_the_two_view_geometry_of_the_rig():

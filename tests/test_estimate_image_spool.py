@@ -1,11 +1,18 @@
-"""Tests of the storage of the keyframes' images."""
+"""Tests of the storage of the keyframes' images and disparities."""
 
+import pickle
 import threading
 
 import numpy as np
 import pytest
+import seafloor_scene as scene
 
+from twin.core import geometry
+from twin.core.records import Frame, Readings
+from twin.core.settings import EstimatorSettings
+from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision import image_spool, matching
+from twin.estimate.vision.stereo import Keyframe
 
 
 def test_a_pair_larger_than_the_cache_is_still_returned(tmp_path, monkeypatch):
@@ -53,3 +60,32 @@ def test_threads_that_read_an_image_wait_until_it_is_written(tmp_path, monkeypat
         reader.join()
     assert found == [image.shape] * 3
     spool.close()
+
+
+def test_the_mosaic_is_rebuilt_from_disparities_on_disk_and_none_are_kept_in_memory(tmp_path):
+    rig, floor, rng = scene.small_rig(), scene.plane(0.05, -0.03, seed=2), np.random.default_rng(3)
+    pose, step = scene.down_camera(0.3, -0.2, 2.0), geometry.exp(np.array([0, 0, 0, 0.6, 0, 0.0]))
+    keyframes, state_bytes = [], []
+    with StereoVision(rig, EstimatorSettings(), tmp_path, cell_m=0.01) as vision:
+        for row in range(3):
+            colour = [np.repeat(image[..., None], 3, axis=2) for image in scene.stereo_pair(floor, rig, pose, rng)[:2]]
+            frame = Frame(row, row / 30, *colour)
+            vision.track_frame(frame)
+            points = vision.observe_stereo(frame, row)
+            vision.add_to_mosaic(row, pose)
+            keyframes.append(Keyframe(row, row, 1, pose, points, Readings()))
+            state_bytes.append(len(pickle.dumps(vision)))
+            pose = pose @ step
+        window = -300, -300, 600, 600
+        added = vision.mosaic.cells.read(*window)
+        vision.rebuild_mosaic(keyframes[:1])
+        first = vision.mosaic.cells.read(*window)
+        vision.rebuild_mosaic(keyframes)
+        rebuilt = vision.mosaic.cells.read(*window)
+    assert state_bytes[2] - state_bytes[1] < rig.width_px * rig.height_px / 2  # half a byte a pixel
+    shown = np.isfinite(added[1])
+    assert 0 < np.isfinite(first[1]).sum() < 0.9 * shown.sum()
+    assert np.mean(np.isfinite(rebuilt[1]) == shown) > 0.999
+    both = np.isfinite(rebuilt[1]) & shown
+    assert np.quantile(np.abs(rebuilt[1][both] - added[1][both]), 0.999) < 2e-3
+    assert np.mean(rebuilt[2][both] == added[2][both]) > 0.999

@@ -124,7 +124,7 @@ def test_a_pair_is_matched_again_for_the_map_only_where_the_light_pattern_has_ch
     left, right = (np.repeat(image[..., None], 3, axis=2).astype(np.uint8) for image in pair)
     pattern = np.zeros((2, DEGREE + 1, DEGREE + 1))
     with StereoVision(RIG, EstimatorSettings(), tmp_path) as vision:
-        found = disparity.match_densely(*pair).fine
+        found = disparity.match_densely(*pair)
         vision.spool.put(7, left, right, tuple(pair), found)
         vision._known_patterns[7] = pattern
         for change, known in ((0.1, True), (1.0, False)):
@@ -132,5 +132,5 @@ def test_a_pair_is_matched_again_for_the_map_only_where_the_light_pattern_has_ch
             changed[1, 1, 0] = change  # a slope of the right image; its RMS is 0.58 of this
             image, other = vision._map_view(7, changed)
             np.testing.assert_array_equal(image, left)
-            expected = found.disparity_px if known else right
+            expected = found.fine.disparity_px if known else right
             np.testing.assert_allclose(other.disparity_px if known else other, expected, atol=0.002)

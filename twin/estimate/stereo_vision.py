@@ -5,7 +5,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -16,6 +15,7 @@ from twin.core.records import (
     Frame,
     Image,
     ImuReadings,
+    Map,
     MapGrid,
     SensorNoise,
     StereoObservation,
@@ -71,7 +71,7 @@ class StereoVision(AbstractContextManager["StereoVision"]):
         self._configure(binning=1)
         self.stereo_observations: list[StereoObservation] = []
         self._repetition: dict[int, float] = {}  # of the images of keyframes, by frame index
-        self._depth_of_keyframe: dict[int, NDArray[np.float16]] = {}
+        self._in_mosaic: set[int] = set()  # numbers of the keyframes that it shows
         self._points: StereoPoints | None = None
 
     def _configure(self, binning: int) -> None:
@@ -127,13 +127,15 @@ class StereoVision(AbstractContextManager["StereoVision"]):
         if len(points.xyz) < _MIN_POINTS:
             del self._pattern_fits[row]
             return None
-        far_enough_px = np.where(dense.best_px > 1.0, dense.best_px, np.nan)
-        depth_m = self.rig.focal_px * self.rig.baseline_m / far_enough_px
-        self._points, self._depth_m = points, depth_m.astype(np.float32)
-        self.spool.put(row, left, corrected, (self._gray, gray), dense.fine)
+        self._points, self._depth_m = points, self._depth(dense)
+        self.spool.put(row, left, corrected, (self._gray, gray), dense)
         self.matcher.removed_yaw[row] = float(self.calibration.removed[1])
         self.matcher.twists[row] = self.f2f.filter.velocity.copy()
         return points
+
+    def _depth(self, dense: DenseMatch) -> Map:
+        far_enough_px = np.where(dense.best_px > 1.0, dense.best_px, np.nan)
+        return np.asarray(self.rig.focal_px * self.rig.baseline_m / far_enough_px, np.float32)
 
     def _choose_scale(self, left: Image, right: Image, imu: ImuReadings | None) -> None:
         """Chooses the binning from a stereo pair before the first keyframe; a change reprocesses the left image."""
@@ -193,15 +195,15 @@ class StereoVision(AbstractContextManager["StereoVision"]):
         if not can_represent(self._depth_m):
             return
         self.mosaic.add(number, self._image, self._depth_m, self._on_plane(world_from_camera), self.rig)
-        self._depth_of_keyframe[number] = self._depth_m.astype(np.float16)
+        self._in_mosaic.add(number)
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
         self.mosaic.cells.clear()
-        shown = [key for key in keyframes if key.number in self._depth_of_keyframe]
-        self._depth_of_keyframe = {key.number: self._depth_of_keyframe[key.number] for key in shown}
-        for key in shown:
+        for key in keyframes:
+            if key.number not in self._in_mosaic:
+                continue
             image = matching.normalise(self.spool.gray(key.row)[0])
-            depth_m = self._depth_of_keyframe[key.number].astype(np.float32)
+            depth_m = self._depth(self.spool.disparity(key.row))
             self.mosaic.add(key.number, image, depth_m, self._on_plane(key.world_from_camera), self.rig)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
@@ -262,7 +264,7 @@ class StereoVision(AbstractContextManager["StereoVision"]):
     def _map_view(self, row: int, pattern: Array | None) -> MapView:
         left = matching.binned(self.spool.left(row), self.binning)
         if pattern_difference(self._known_patterns[row], pattern) <= _PATTERN_CHANGE:
-            return left, self.spool.disparity(row)
+            return left, self.spool.disparity(row).fine
         return left, matching.binned(self.spool.right(row), self.binning)
 
     def left_image(self, row: int) -> Image | None:

@@ -22,6 +22,7 @@ NORMALISATION_WINDOW = 1 / 7
 CONSISTENCY_PX = 1.0  #: largest difference between left-to-right and right-to-left disparity [px]; above: occlusion
 MIN_SIGMA_PX = 0.03  #: of errors that the refinement does not model (interpolation, relief inside the window) [px]
 MAX_DISPARITY_FRACTION = 0.4  #: largest disparity that is searched, as a fraction of the image width
+_SEARCH_STEP_PX = 16  # the number of disparities that are searched is a multiple of this
 #: Images are reduced by this factor to find the range of disparities; smallest number of known ones; quantile of them,
 #: and relative and absolute [px] margin beyond it at both ends.
 _REDUCTION, _LEAST_KNOWN, _QUANTILE, _MARGIN, _MARGIN_PX = 4, 100, 0.001, 0.1, 8
@@ -40,17 +41,6 @@ class Disparity(NamedTuple):
         unknown = np.float32(np.nan)
         return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))
 
-    def packed(self) -> NDArray[np.uint16]:
-        """Returns it as whole numbers (2, H, W): disparities in steps of a 65,000th of the widest, sigmas as halves."""
-        steps = np.rint(np.nan_to_num(self.disparity_px) / _step_px(self.disparity_px.shape[1]))
-        return np.stack([steps.astype(np.uint16), self.sigma_px.astype(np.float16).view(np.uint16)])
-
-    @classmethod
-    def unpacked(cls, packed: NDArray[np.uint16]) -> Disparity:
-        sigma_px = packed[1].view(np.float16).astype(np.float32)
-        disparity_px = packed[0] * _step_px(packed.shape[2])
-        return cls(np.where(np.isnan(sigma_px), np.float32(np.nan), disparity_px), sigma_px)
-
 
 class DenseMatch(NamedTuple):
     """Disparity of a stereo pair before and after the refinement."""
@@ -62,6 +52,18 @@ class DenseMatch(NamedTuple):
     def best_px(self) -> Map:
         """Returns the refined disparity (H, W) [px], or the coarse one where that is unknown."""
         return np.where(np.isfinite(self.fine.disparity_px), self.fine.disparity_px, self.coarse_px)
+
+    def packed(self) -> NDArray[np.uint16]:
+        """Returns whole numbers (2, H, W): the best disparities in equal steps, the sigmas of the fine ones as halves."""
+        steps = np.rint(np.nan_to_num(self.best_px) / _step_px(self.best_px.shape[1]))
+        return np.stack([steps.astype(np.uint16), self.fine.sigma_px.astype(np.float16).view(np.uint16)])
+
+    @classmethod
+    def unpacked(cls, packed: NDArray[np.uint16]) -> DenseMatch:
+        """Returns what was packed; the coarse disparity is the best one."""
+        sigma_px = packed[1].view(np.float16).astype(np.float32)
+        best_px = np.where(packed[0] > 0, packed[0] * _step_px(packed.shape[2]), np.float32(np.nan))
+        return cls(best_px, Disparity(np.where(np.isnan(sigma_px), np.float32(np.nan), best_px), sigma_px))
 
 
 def match_densely(left: Image | Map, right: Image | Map) -> DenseMatch:
@@ -98,9 +100,9 @@ def search_range(left: Image, right: Image) -> tuple[int, int]:
 def search(left: Image, right: Image, range_px: tuple[int, int], speckle_px: int = SPECKLE_PX) -> Map:
     """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown."""
     # images (H, W) of normalised contrast, padded on the left: otherwise the left margin, as wide as the largest
-    # disparity searched (their number is a multiple of 16), would have no disparity
+    # disparity searched, would have no disparity
     low, high = range_px
-    count = -(-max(high - low, 1) // 16) * 16
+    count = -(-max(high - low, 1) // _SEARCH_STEP_PX) * _SEARCH_STEP_PX
     matcher = cv2.StereoSGBM.create(
         low, count, BLOCK_PX, P1=8 * BLOCK_PX**2, P2=32 * BLOCK_PX**2, disp12MaxDiff=1, preFilterCap=63,
         speckleWindowSize=speckle_px, speckleRange=1, mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
@@ -128,7 +130,7 @@ def _search_consistent(left: Image, right: Image) -> Map:
 
 
 def _step_px(width_px: int) -> np.float32:
-    return np.float32(MAX_DISPARITY_FRACTION * width_px / 65000)
+    return np.float32((MAX_DISPARITY_FRACTION * width_px + _SEARCH_STEP_PX) / 65000)
 
 
 def _normalise_contrast(image: Image | Map) -> Image:

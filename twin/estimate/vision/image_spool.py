@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from twin.core.checkpoint import check_hash
 from twin.core.records import Image
 from twin.estimate.vision import matching
-from twin.estimate.vision.disparity import Disparity
+from twin.estimate.vision.disparity import DenseMatch
 
 _Grays = tuple[matching.Gray, matching.Gray]  # of the left and the right image
 _CACHE_BYTES = 64 * 2**20
@@ -57,10 +57,10 @@ class ImageSpool:
             check_hash(file, expected)
         self._start()
 
-    def put(self, row: int, left: Image, right: Image, gray: _Grays, disparity: Disparity | None = None) -> None:
+    def put(self, row: int, left: Image, right: Image, gray: _Grays, dense: DenseMatch | None = None) -> None:
         """Stores the full stereo pair of a keyframe, which another thread writes; binned grey levels and disparity."""
         self.flush()
-        self._writing = self._writer.submit(self._write, row, left, right, disparity)
+        self._writing = self._writer.submit(self._write, row, left, right, dense)
         with self._lock:
             self._cache(row, gray)
 
@@ -92,11 +92,11 @@ class ImageSpool:
     def right(self, row: int) -> Image:
         return self._read(row, "right")
 
-    def disparity(self, row: int) -> Disparity:
+    def disparity(self, row: int) -> DenseMatch:
         self.flush()
         file = self._path(row, "disparity", ".npy")
         try:
-            return Disparity.unpacked(np.load(file))
+            return DenseMatch.unpacked(np.load(file))
         except (ValueError, EOFError) as error:
             raise OSError(f"{file} cannot be read: {error}") from None
 
@@ -115,13 +115,13 @@ class ImageSpool:
         while len(self._gray) > 1 and len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)
 
-    def _write(self, row: int, left: Image, right: Image, disparity: Disparity | None) -> None:
+    def _write(self, row: int, left: Image, right: Image, dense: DenseMatch | None) -> None:
         for side, image in (("left", left), ("right", right)):
             data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
             self._write_file(self._path(row, side), data)
-        if disparity is not None:
+        if dense is not None:
             stream = BytesIO()
-            np.save(stream, disparity.packed())
+            np.save(stream, dense.packed())
             self._write_file(self._path(row, "disparity", ".npy"), stream.getvalue())
 
     def _write_file(self, file: Path, data: bytes) -> None:
