@@ -66,11 +66,12 @@ def test_the_recording_holds_the_whole_survey_on_both_timelines(folder):
     assert time.perf_counter() - start < 10
     assert file == folder / "run.rrd" and file.stat().st_size < 10_000_000
     entities = contents(file)
-    expected = PATHS | ERRORS | {"/world", "/world/true_floor", "/world/network", "/world/rig", "/mosaic", "/summary"}
+    expected = PATHS | ERRORS | {"/world", "/world/true_floor", "/world/rig", "/mosaic", "/summary"}
     expected |= {"/world/rig/left", "/world/rig/right", "/timing/f2f", "/timing/stereo", "/timing/ga"}
     expected |= {f"/attitude/{angle}/{name}" for angle in ("roll", "pitch", "heading") for name in ("truth", "final")}
     assert expected <= set(entities)
-    assert sum(entity.startswith("/world/map/") for entity in entities) > 10
+    for parts in ("map", "network"):
+        assert sum(entity.startswith(f"/world/{parts}/") for entity in entities) > 10
     static = {"/world", "/world/true_floor", "/world/path/reference", "/summary"}
     for entity in expected - static:
         assert {"frame", "sim_time"} <= entities[entity][0], entity
@@ -317,9 +318,20 @@ def test_links_are_coloured_by_their_residuals(folder):
     large = run.keyframes.link_residuals.copy()
     large[:], large[-1] = 0.9, 3.1
     marked = replace(run, keyframes=run.keyframes._replace(link_residuals=large))
-    last = rows(recording.record_run(marked), "/world/network")[-1]
-    colours = [f"{colour:08x}"[:6] for colour in last["colors"]]
-    assert colours[:-1] == ["7f96a3"] * (len(large) - 1) and colours[-1] == "cc3311"
+    file = recording.record_run(marked)
+    parts = [entity for entity in contents(file) if entity.startswith("/world/network/")]
+    logged = [row for part in parts for row in rows(file, part)]
+    colours = [f"{colour:08x}"[:6] for row in logged for colour in row["colors"]]
+    assert sorted(colours) == ["7f96a3"] * (len(large) - 1) + ["cc3311"]  # each link once
+    shown = np.concatenate([np.reshape(row["strips"], (-1, 2, 3)) for row in logged])
+    positions, edges = run.network
+    for side in range(2):
+        expected, found = (np.sort(points[:, 0]) for points in (positions[edges[:, side]], shown[:, side]))
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    keys = run.keyframes
+    for part in parts:  # a link appears at the first snapshot that has both its keyframes
+        (row,) = rows(file, part)
+        assert row["frame"] == keys.frames[recording.snapshots(len(keys.frames))[int(part[-2:])]]
 
 
 def test_events_of_the_log_are_logged_at_their_times(folder):

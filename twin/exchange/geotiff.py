@@ -130,8 +130,9 @@ def check_written(path: Path) -> None:
     whole = False
     with suppress(RasterioIOError), rasterio.open(path, driver="GTiff") as file:
         (rows, cols), n_bytes = file.block_shapes[0], path.stat().st_size
-        blocks = product(range(-(-file.width // cols)), range(-(-file.height // rows)))
-        items = ([file.get_tag_item(f"BLOCK_{k}_{c}_{r}", "TIFF", 1) for k in ("OFFSET", "SIZE")] for c, r in blocks)
+        blocks = product(file.indexes, range(-(-file.width // cols)), range(-(-file.height // rows)))
+        kinds = "OFFSET", "SIZE"
+        items = ([file.get_tag_item(f"BLOCK_{k}_{c}_{r}", "TIFF", band) for k in kinds] for band, c, r in blocks)
         whole = all(start and size and int(start) + int(size) <= n_bytes for start, size in items)
     if not whole:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
@@ -143,7 +144,7 @@ class OrthomosaicFile(ExitStack):
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
         super().__init__()
         tiles = {"tiled": True, "blockxsize": 256, "blockysize": 256, "bigtiff": "IF_SAFER"}
-        colours = {"predictor": 2, "zlevel": 9, "photometric": "RGB", "alpha": "unspecified"}
+        colours = {"predictor": 2, "zlevel": 9, "interleave": "band", "photometric": "RGB", "alpha": "unspecified"}
         self._file = self.enter_context(_created(path, profile(grid, 4, "uint8", georeference) | tiles | colours))
         self._file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         self._file.update_tags(**placement_tags(georeference))

@@ -25,7 +25,7 @@ def write(path: Path, result: SurveyResult) -> None:
     vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_pose_texts(poses)))
     links = result.links
     upper = links.information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER]
-    motions, informations = _pose_texts(links.i_from_j), _row_texts(upper, "%.9g")
+    motions, informations = _pose_texts(links.i_from_j), _row_texts(upper, "%.7g")
     edges = "".join(
         f"EDGE_SE3:QUAT {i} {j} {motion} {information}\n"
         for i, j, motion, information in zip(links.i, links.j, motions, informations, strict=True)
@@ -35,7 +35,8 @@ def write(path: Path, result: SurveyResult) -> None:
 
 def _pose_texts(poses: Array) -> list[str]:
     """Returns the text "x y z qx qy qz qw" of each of the poses (n, 4, 4)."""
-    return _row_texts(np.column_stack([poses[:, :3, 3], geometry.quaternions_xyzw(poses[:, :3, :3])]), "%.12g")
+    rows = np.column_stack([poses[:, :3, 3], geometry.quaternions_xyzw(poses[:, :3, :3])])
+    return _row_texts(np.round(rows, 10) + 0.0, "%.12g")
 
 
 def _row_texts(rows: Array, number_format: str) -> list[str]:

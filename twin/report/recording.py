@@ -149,17 +149,20 @@ def log_paths(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_network(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs at the snapshots the links so far and the ellipsoids of some keyframes, enlarged as their name says."""
+    """Logs at each snapshot its new links, and the ellipsoids of some keyframes so far, enlarged as their name says."""
     keys, (positions, edges) = run.keyframes, run.network
     residuals = keys.link_residuals if len(keys.link_residuals) == len(edges) else np.zeros(len(edges))
     shown = np.arange(0, min(len(keys.position_cov_m2), len(positions)), stride(len(positions), N_ELLIPSOIDS))
     half_axes_m, quaternions = ellipsoids(keys.position_cov_m2[shown])
     factor = enlargement(half_axes_m, np.linalg.norm(positions - positions[:1], axis=1).max(initial=0))
-    for last in snapshots(len(keys.frames)):
+    steps = snapshots(len(keys.frames))
+    first_seen = np.searchsorted(steps, edges.max(axis=1))  # snapshot of each link
+    for number, last in enumerate(steps):
         _set_time(recording, run, keys.frames[last])
-        links, n = edges.max(axis=1) <= last, np.searchsorted(shown, last, side="right")
+        links, n = first_seen == number, np.searchsorted(shown, last, side="right")
         strips, colours = positions[edges[links]].astype(np.float32), residual_colours(residuals[links])
-        recording.log("world/network", rr.LineStrips3D(strips, colors=colours, radii=rr.Radius.ui_points(0.6)))
+        lines = rr.LineStrips3D(strips, colors=colours, radii=rr.Radius.ui_points(0.6))
+        recording.log(f"world/network/{number:02d}", lines)
         if n:
             at, half_axes, turns = positions[shown[:n]], factor * half_axes_m[:n], quaternions[:n]
             some = rr.Ellipsoids3D(centers=at, half_sizes=half_axes, quaternions=turns, colors=rgb("final"))

@@ -37,12 +37,9 @@ def trimmed_hull(vehicle: VehicleConfig) -> Hull:
         inertia=np.array([*rov.inertia_kgm2, *[rov.mass_kg] * 3]),
         added_inertia=vehicle.added_mass_factor * _both_angular_first(rov.added_mass),
         linear_drag=vehicle.drag_factor * _both_angular_first(rov.linear_drag),
-        quadratic_drag=vehicle.drag_factor * _both_angular_first(rov.quadratic_drag),
-        drag_centre_m=rov.drag_centre_m,
-        centre_of_buoyancy_m=rov.centre_of_buoyancy_m,
-        weight_n=weight_n,
-        buoyancy_n=weight_n + vehicle.buoyancy_n,
-    )
+        quadratic_drag=vehicle.drag_factor * _both_angular_first(rov.quadratic_drag), drag_centre_m=rov.drag_centre_m,
+        centre_of_buoyancy_m=rov.centre_of_buoyancy_m, weight_n=weight_n, buoyancy_n=weight_n + vehicle.buoyancy_n,
+    )  # fmt: skip
 
 
 def _both_angular_first(matrix: Array) -> Array:

@@ -188,15 +188,10 @@ class CandidateSurveys:
 
     def add(self, row: Row) -> None:
         self._scores[key_of(row)] = SurveyScore(
-            row["status"],
-            has_passed(row),
-            {name: row.get(name) for name in self.metrics},
-            row.get("warning") or "",
-            row["scenario_hash"],
-            failure_reason(row),
-            bool(row.get("unmodelled")),
+            row["status"], has_passed(row), {name: row.get(name) for name in self.metrics}, row.get("warning") or "",
+            row["scenario_hash"], failure_reason(row), bool(row.get("unmodelled")),
             {f"{cause}_error_m": row.get(f"map.{cause}_error_m") for cause in CAUSES},
-        )
+        )  # fmt: skip
 
     def _samples(self, number: int, values: Values) -> Iterator[Sample]:
         for condition in self.conditions:

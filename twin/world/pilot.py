@@ -173,14 +173,12 @@ class RovPilot:
             camera_from_body=geometry.inverse(rig.body_from_camera),
             body_from_camera_twist=geometry.adjoint(rig.body_from_camera),
             lever_arm_m=rig.body_from_camera[:3, 3].copy(),
-            smoothing=1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz),
-            twist=np.zeros(6),
+            smoothing=1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz), twist=np.zeros(6),
             controller=nominal_controller(
                 scenario.vehicle, frequency, rig.frame_rate_hz, _VELOCITY_SMOOTHING_S + latency_s
             ),
-            latency_s=latency_s,
-            waiting=np.zeros((n_late, len(scenario.vehicle.thrusters))),
-        )
+            latency_s=latency_s, waiting=np.zeros((n_late, len(scenario.vehicle.thrusters))),
+        )  # fmt: skip
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
         if self._monitor is not None and len(self._monitor.lost) > self._n_lost:

@@ -197,16 +197,12 @@ class World(ABC):
             reference=np.concatenate([np.empty((0, 3)), *(part.reference.position for part in parts)])[:n],
             holding=np.repeat(np.array([part.holding for part in parts], np.bool_), lengths)[:n],
             track=np.repeat(np.array([part.track for part in parts], np.int64), lengths)[:n],
-            height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
-            seen=self.seen() & ~unknown,
+            height_m=np.where(unknown, np.float32(np.nan), surface.height_m), seen=self.seen() & ~unknown,
             asked=at_centres(self.mission.asked, cells),
             reference_yaw=np.concatenate([np.empty(0), *(np.asarray(part.reference.yaw) for part in parts)])[:n],
-            albedo=albedo,
-            in_area=self.mission.asked,
-            objects=surface.objects,
-            overhung=surface.overhung,
+            albedo=albedo, in_area=self.mission.asked, objects=surface.objects, overhung=surface.overhung,
             heights_to_follow=self._heights_to_follow() if self.mission.plan.follows_floor else None,
-        )
+        )  # fmt: skip
 
     def true_floor(self) -> Terrain:
         """Returns the floor as a height grid, with the objects that this world simulates."""

@@ -64,14 +64,9 @@ class BagReader:
         if self._topics.truth is not None:
             truth = _truth(bag, self._topics.truth, camera, transforms, notes)
         return Dataset(
-            folder,
-            frames,
-            value_or_error(lambda: _calibration(bag, topics, transforms)),
-            truth,
-            n_right_only,
-            tuple(notes),
-            readings=value_or_error(lambda: read_bag(bag, camera, transforms)),
-        )
+            folder, frames, value_or_error(lambda: _calibration(bag, topics, transforms)), truth, n_right_only,
+            tuple(notes), readings=value_or_error(lambda: read_bag(bag, camera, transforms)),
+        )  # fmt: skip
 
     def _stereo_topics(self, bag: Bag) -> StereoTopics:
         images = image_topics(bag.topics)

@@ -60,15 +60,11 @@ def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
     offset = np.cumsum(np.append(0, BLOCK * BLOCK * width * (width + np.diff(row_start))))
     row, column = np.maximum(permutation[i], permutation[j]), np.minimum(permutation[i], permutation[j])
     return SymbolicFactor(
-        permutation=permutation,
-        panel_start=panel_start,
-        row_start=row_start,
-        rows=np.concatenate([np.empty(0, np.int64), *rows]),
-        offset=offset,
-        panel_of=np.repeat(np.arange(len(panels)), width),
-        off_diagonal=np.column_stack([row, column]),
+        permutation=permutation, panel_start=panel_start, row_start=row_start,
+        rows=np.concatenate([np.empty(0, np.int64), *rows]), offset=offset,
+        panel_of=np.repeat(np.arange(len(panels)), width), off_diagonal=np.column_stack([row, column]),
         transposed=permutation[i] < permutation[j],
-    )
+    )  # fmt: skip
 
 
 def _minimum_degree(n: int, i: Indices, j: Indices) -> Indices:

@@ -54,7 +54,7 @@ class DenseMatch(NamedTuple):
         return np.where(np.isfinite(self.fine.disparity_px), self.fine.disparity_px, self.coarse_px)
 
     def packed(self) -> NDArray[np.uint16]:
-        """Returns whole numbers (2, H, W): the best disparities in equal steps, the sigmas of the fine ones as halves."""
+        """Returns whole numbers (2, H, W): best disparities in equal steps, sigmas of the fine ones as halves."""
         steps = np.rint(np.nan_to_num(self.best_px) / _step_px(self.best_px.shape[1]))
         return np.stack([steps.astype(np.uint16), self.fine.sigma_px.astype(np.float16).view(np.uint16)])
 
