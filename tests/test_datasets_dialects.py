@@ -434,6 +434,25 @@ def test_a_chosen_field_of_view_is_that_of_the_rectified_images(kind, lens):
     assert 2 * np.degrees(np.arctan(SIZE[0] / 2 / found.fx_px)) == pytest.approx(60.0)
 
 
+def test_beyond_the_largest_angle_of_a_polynomial_rectified_images_are_black():
+    """With k1 = -0.5 alone, r (1 + k1 r^2) falls beyond r = (1.5)^-0.5: there, a second image would be shown."""
+    rig = wide_rig("radtan", 170.0, (-0.5, 0.0, 0.0, 0.0))
+    largest_deg = np.degrees(np.arctan(1.5**-0.5))
+    with pytest.raises(TwinError, match=f"5 to {2 * largest_deg:.0f} deg"):
+        rectification(rig, 1.0, 85.0)
+    found = rectification(rig, 1.0, 76.0)
+    assert f" of {2 * largest_deg:.0f} deg across" in found.kept
+    v, u = np.mgrid[0 : SIZE[1] : 20, 0 : SIZE[0] : 20].reshape(2, -1)
+    rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(found.rig.matrix).T
+    in_left = geometry.transform(found.left_from_rectified, rays)
+    angle_deg = np.degrees(np.arctan2(np.hypot(*in_left.T[:2]), in_left[:, 2]))
+    beyond = angle_deg > largest_deg + 0.1
+    shown = angle_deg < largest_deg - 0.1
+    assert beyond.sum() > 20 and shown.sum() > 300
+    image = found.rectified(np.full((SIZE[1], SIZE[0], 3), 100, np.uint8), "left")
+    assert not image[v[beyond], u[beyond]].any() and image[v[shown], u[shown]].all()
+
+
 def test_the_maps_of_a_double_sphere_are_where_its_model_projects_the_rectified_rays():
     rig = wide_rig("double_sphere", 120.0, DOUBLE_SPHERE)
     found = rectification(rig, 1.0)

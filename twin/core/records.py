@@ -273,7 +273,7 @@ class Trajectory:
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, :3] = geometry.rotation_from_wxyz(rows[:, [7, 4, 5, 6]])
         poses[:, :3, 3] = rows[:, 1:4]
-        return Trajectory(rows[:, 0], poses)
+        return Trajectory(rows[:, 0].copy(), poses)  # a view would keep all of the rows
 
 
 class Alignment(NamedTuple):

@@ -19,6 +19,8 @@ from twin.errors import TwinError, described
 if TYPE_CHECKING:
     import rasterio
 
+os.environ.setdefault("GDAL_CACHEMAX", "64")  # blocks of rasters in memory [MB]; by default 5 % of all memory
+
 MOST_TEXT_BYTES = 64 * 2**20  #: largest text file, unless its reader sets another limit
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")  #: formats of images by their names in Pillow
 MOST_IMAGE_BYTES = 512 * 2**20  #: largest encoded image

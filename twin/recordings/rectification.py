@@ -112,12 +112,22 @@ def _centre_focal_px(camera: RecordedCamera) -> float:
 def _field_deg(camera: RecordedCamera) -> float:
     """Returns the horizontal field of view through the principal point, up to 220 deg (radtan: 180 deg)."""
     assert camera.size_px is not None
+    angles, columns, last_deg = _row_through_centre(camera)
+    outside = angles[(columns < -0.5) | (columns > camera.size_px[0] - 0.5)]
+    return float(outside.min(where=outside > 0, initial=last_deg) - outside.max(where=outside < 0, initial=-last_deg))
+
+
+def _row_through_centre(camera: RecordedCamera) -> tuple[Array, Array, float]:
+    """Returns angles (n,) of rays from the optical axis [deg], their columns (n,) [px], and the largest valid angle.
+
+    Beyond the last [deg], the polynomial of the distortion falls, so that it shows directions that the lens does not.
+    """
     widest = 90 if camera.kind == "radtan" else 110
     angles = np.linspace(-widest, widest, 20 * widest + 2)[1:-1]
     rays = np.column_stack([np.sin(np.radians(angles)), 0 * angles, np.cos(np.radians(angles))])
     columns = camera.project(rays)[:, 0]
-    outside = angles[(columns < -0.5) | (columns > camera.size_px[0] - 0.5)]
-    return float(outside.min(where=outside > 0, initial=widest) - outside.max(where=outside < 0, initial=-widest))
+    falls = np.abs(angles[1:])[np.diff(columns) <= 0]
+    return angles, columns, float(falls.min(initial=widest))
 
 
 def is_rectified(calibration: StereoCalibration) -> bool:
@@ -144,10 +154,12 @@ def _rig(matrix: Array, calibration: StereoCalibration, size_px: tuple[int, int]
 
 def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> Positions:
     """Returns column and row (H, W, 2) [px] in the recorded image; `turn` is rectified_from_recorded (3, 3)."""
-    size = rig.width_px, rig.height_px
-    if camera.kind == "radtan":
-        maps = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, rig.matrix, size, cv2.CV_32FC1)
-        return np.stack(maps, axis=-1).astype(np.float32)
-    row, column = np.indices(size[::-1])
-    rays = np.stack([column, row, np.ones_like(row)], axis=-1).reshape(-1, 3) @ np.linalg.inv(rig.matrix).T @ turn
-    return camera.project(rays).reshape(*size[::-1], 2).astype(np.float32)
+    ray_from_pixel, last_deg = np.linalg.inv(rig.matrix).T @ turn, _row_through_centre(camera)[2]
+    positions, pixels = np.empty((rig.height_px, rig.width_px, 2), np.float32), np.ones((rig.width_px, 3))
+    pixels[:, 0] = np.arange(rig.width_px)
+    for row, of_row in enumerate(positions):
+        pixels[:, 1] = row
+        x, y, z = rays = (pixels @ ray_from_pixel).T
+        of_row[:] = camera.project(rays.T)
+        of_row[np.degrees(np.arctan2(np.hypot(x, y), z)) > last_deg] = -1e4  # outside
+    return positions
