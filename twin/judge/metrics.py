@@ -16,6 +16,7 @@ from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.judge.recorded import (
     RecordedTruth,
     associate,
+    in_world,
     recorded_consistency,
     recorded_errors,
     recorded_map_metrics,
@@ -128,6 +129,7 @@ def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
 
 def _replay_sections(survey: EvaluationInput, truth: RecordedTruth) -> dict[str, Any]:
     result, elevation, empty, true = survey.result, survey.elevation, empty_metrics(), truth.trajectory
+    true = None if true is None else in_world(true, result.final, truth.alignment)  # axes of errors as in the report
     errors = {} if true is None else {k: recorded_errors(p, true, truth.alignment) for k, p in _paths(result).items()}
     heights = {} if elevation is None else {"cell_m": elevation.grid.cell_m} | errors_by_cause(elevation)
     if elevation is not None and truth.heights_m is not None:

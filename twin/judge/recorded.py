@@ -90,6 +90,17 @@ def true_from_world(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
     return rigid_alignment(a.positions, b.positions)
 
 
+def in_world(truth: Trajectory, estimate: Trajectory, alignment: AlignmentName) -> Trajectory:
+    """Returns the truth, moved to the world of an estimate."""
+    world_from_true = geometry.inverse(true_from_world(estimate, truth, alignment))
+    return Trajectory(truth.times_s, world_from_true @ truth.world_from_camera)
+
+
+def are_comparable(estimate: Trajectory, truth: Trajectory) -> bool:
+    """Returns whether enough frames have a true pose for errors of any alignment."""
+    return len(associate(estimate.times_s, truth.times_s).truth) >= _MIN_ASSOCIATED
+
+
 def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: AlignmentName) -> PathErrors:
     """Returns the errors of the aligned estimate at the frames that have a true pose; empty for fewer than three."""
     a, b = _associated_poses(estimate, truth)
@@ -103,11 +114,11 @@ def recorded_consistency(result: SurveyResult, truth: Trajectory, alignment: Ali
 
     Errors are those after the alignment: without the keyframe at which it was done for "first", and smaller than
     before for "se3", as it takes a part of them. Errors of the truth count as errors of the estimate; empty if it is
-    interpolated.
+    interpolated, or fewer than three frames have a true pose.
     """
     n, final = min(len(result.keyframe_rows), len(result.node_cov)), result.final
     rows = associate(final.times_s, truth.times_s)
-    if _interpolated(truth):
+    if len(rows.truth) < _MIN_ASSOCIATED or _interpolated(truth) or _interpolated(_selected(truth, rows.truth)):
         return {}
     used = np.flatnonzero(np.isin(result.keyframe_rows[:n], rows.estimate))
     used = used[1:] if alignment == "first" else used
@@ -153,7 +164,7 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
             f"The axes of the truth are turned by {angle_deg:.0f} degrees (sigma {sigma_deg:.0f}) from those of the "
             "left camera: the truth seems to be that of another body."
         )
-    if _interpolated(b):
+    if _interpolated(b) or _interpolated(truth):
         found.append(
             "The true poses lie on the same screw motion for most of the frames: they seem to be interpolated, so the"
             " errors of attitude and across the path, and the covariances, cannot be judged by them."
@@ -197,7 +208,7 @@ def _clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float
 
     misfits_m = np.array([misfit_m(shift_s) for shift_s in shifts_s])
     best, as_given_m = int(np.argmin(misfits_m)), float(misfits_m[len(shifts_s) // 2])
-    if abs(shifts_s[best]) <= step_s or not misfits_m[best] < _CLEARLY * as_given_m:
+    if abs(shifts_s[best]) <= step_s or np.isinf(as_given_m) or not misfits_m[best] < _CLEARLY * as_given_m:
         return None
     return float(shifts_s[best]), float(misfits_m[best]), as_given_m
 

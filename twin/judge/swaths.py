@@ -101,7 +101,8 @@ def control_metrics(truth: Truth) -> dict[str, float | None]:
     if truth.heights_to_follow is not None and n:
         x, y, z = truth.trajectory.positions[:n].T
         wanted_m, floor_m = truth.heights_to_follow(x, y)
-        height = {"height_error_rmse_m": rms(z - wanted_m), "least_height_m": percentile(z - floor_m, 0)}
+        error_m, above_m = (part[np.isfinite(part)] for part in (z - wanted_m, z - floor_m))  # NaN beyond the terrain
+        height = {"height_error_rmse_m": rms(error_m), "least_height_m": percentile(above_m, 0)}
     return {
         "cross_track_rmse_m": rms(across[~holding]),
         "altitude_rmse_m": rms(offset[:, 2]),

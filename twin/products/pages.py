@@ -1,6 +1,7 @@
 """Results of `twin products` and `twin change`: from run folders to sentences, JSON, GeoTIFFs and pages."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,10 +10,11 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from twin.core import geometry
 from twin.core.records import MapGrid
 from twin.errors import TwinError
 from twin.exchange.geotiff import Raster, write_layer
-from twin.judge.summary_statistics import finite_tree
+from twin.judge.summary_statistics import finite_tree, mean
 from twin.products.change import Change, change_between
 from twin.products.registration import PARAMETERS, Heights
 from twin.products.surface import Layer, block_means, slope_deg
@@ -79,7 +81,8 @@ def products_of(folder: Path, level_m: float | None = None) -> Results:
         raise TwinError("RUN", f"{run.folder} has no trajectory_final.tum", "a finished run")
     if missing := {"hfov_deg", "image_width_px", "baseline_m"} - rig.keys():
         raise TwinError(f"RUN: {SCENARIO_FILE}: rig.{min(missing)}", "missing", "a file of `twin run` or `twin replay`")
-    above_floor_m = np.median(run.trajectories["final"].positions[:, 2]) - np.nanmedian(heights.height_m)
+    in_map = geometry.transform(run.keyframes.map_from_world, run.trajectories["final"].positions)
+    above_floor_m = np.median(in_map[:, 2]) - np.nanmedian(heights.height_m)
     width_m = float(2 * above_floor_m * np.tan(np.deg2rad(rig["hfov_deg"]) / 2))
     errors = error_field_of_map(heights, width_m / rig["image_width_px"], width_m)
     baseline_sigma_mm = run.scenario.get("calibration_error", {}).get("baseline_sigma_mm", 0.0)
@@ -91,13 +94,18 @@ def products_of(folder: Path, level_m: float | None = None) -> Results:
         "slope": (Raster(coarse, slope), f"slope, grain {grain_m:g} m", "deg"),
         "height_sigma": (Raster(heights.grid, heights.sigma_m), "standard deviation of the heights", "m"),
     }
-    tree, truth = _tree(products), None
-    if "dem_truth" in run.rasters:
-        true_m = np.where(np.isfinite(heights.height_m), run.rasters["dem_truth"].values, np.nan)
-        exact = errors._replace(sigma_m=np.zeros_like(true_m), long_sigma_m=np.zeros_like(true_m))
-        truth = survey_products(heights._replace(height_m=true_m), exact, level_m=products.level_m)
-        tree |= {"truth": _tree(truth)}
-    return Results("products", run, tree, layers, {"products": products, "truth": truth})
+    tree, variables, true = _tree(products), {"products": products, "truth": None}, run.rasters.get("dem_truth")
+    if true is not None and true.grid == heights.grid:
+        common = np.isfinite(heights.height_m) & np.isfinite(true.values)
+        exact = errors._replace(sigma_m=np.zeros_like(errors.sigma_m), long_sigma_m=np.zeros_like(errors.sigma_m))
+        given = {"compared": (heights.height_m, errors), "truth": (true.values, exact)}
+        with suppress(TwinError):  # too few cells in common
+            variables |= {
+                name: survey_products(heights._replace(height_m=np.where(common, z, np.nan)), e, 0.0, products.level_m)
+                for name, (z, e) in given.items()
+            }
+            tree |= {"truth": _tree(variables["truth"])}
+    return Results("products", run, tree, layers, variables)
 
 
 def change_of(first_folder: Path, second_folder: Path, scale_m: float) -> Results:
@@ -152,7 +160,7 @@ def judged(change: Change, true_m: Layer) -> dict[str, Any]:
         "found": sum(bool(change.labels[one].any()) for one in true),
         "expected": float(sum(probability[one].max() for one in true)),
         "false_patches": sum(not changed[one].any() for one in inside),
-        "false_cells": float(change.significant[cells & ~changed].mean()),
+        "false_cells": mean(change.significant[cells & ~changed]),
         "patch_volume_m3": volumes_m3,
         "volume_error_over_sigma": [(patch.volume_m3 - one) / patch.volume_sigma.total for patch, one in pairs],
     }
@@ -163,6 +171,8 @@ def _heights(run: Run, name: str, kind: str = "sigma") -> Heights:
     for layer in layers:
         if layer not in run.rasters:
             raise TwinError(name, f"{run.folder} has no {layer}.tif", "a run with a map")
+        if run.rasters[layer].grid != run.rasters["dem"].grid:
+            raise TwinError(name, f"{run.folder}: {layer}.tif has other cells than dem.tif", "files of one run")
     return Heights(run.rasters["dem"].grid, *(run.rasters[layer].values for layer in layers))
 
 

@@ -27,8 +27,8 @@ class Heights(NamedTuple):
 class MapRegistration(NamedTuple):
     """Motion of the second map against the first: u = t + w x (p - c) + k (p - c) at the point p; c: map centre.
 
-    With the gradient g of the heights, their difference due to it is u_z - g_x u_x - g_y u_y: the equation of Nuth &
-    Kääb (2011, Cryosphere 5, 271) with rotation and scale.
+    The height of c is the median. With the gradient g of the heights, their difference due to it is
+    u_z - g_x u_x - g_y u_y: the equation of Nuth & Kääb (2011, Cryosphere 5, 271) with rotation and scale.
     """
 
     values: Layer  #: (7,) `PARAMETERS` [m, rad, 1]
@@ -44,10 +44,11 @@ def register(first: Heights, second: Heights, stable: Layer, errors: ErrorField 
     `errors` of the difference are for the covariance; without them, those of the cells count as independent. Raises
     TwinError if the maps have too few such cells in common, or the iteration does not converge.
     """
-    motion = np.zeros(7)
+    motion, (x, y), z = np.zeros(7), np.meshgrid(*first.grid.centres()), np.nan_to_num(first.height_m)
+    offset = np.stack([x - x.mean(), y - y.mean(), z - np.median(z[np.isfinite(first.height_m)])])
     for _ in range(_ROUNDS):
-        height_m, sigma2_m = _moved(second, first.grid, motion)
-        design = _design(first.grid, (first.height_m + height_m) / 2)
+        height_m, sigma2_m = _moved(second, first.grid, offset, motion)
+        design = _design(first.grid, offset, (first.height_m + height_m) / 2)
         difference_m, sigma_m = height_m - first.height_m, np.hypot(first.sigma_m, sigma2_m)
         used = stable & np.isfinite(difference_m) & np.isfinite(design).all(axis=0) & (sigma_m > 0)
         if used.sum() < LEAST_CELLS:
@@ -67,10 +68,9 @@ def register(first: Heights, second: Heights, stable: Layer, errors: ErrorField 
     return MapRegistration(motion, cov, design, difference_m - np.tensordot(step, design, 1), sigma_m)
 
 
-def _moved(heights: Heights, grid: MapGrid, motion: Layer) -> tuple[Layer, Layer]:
+def _moved(heights: Heights, grid: MapGrid, offset: Layer, motion: Layer) -> tuple[Layer, Layer]:
     """Returns heights and standard deviations (rows, cols) [m] on another grid, moved back by a motion; bilinear."""
     x, y = np.meshgrid(*grid.centres())
-    offset = np.stack([x - x.mean(), y - y.mean(), np.zeros_like(x)])
     shift = motion[:3, None, None] + np.cross(motion[3:6], offset, axisb=0, axisc=0) + motion[6] * offset
     col = (x + shift[0] - heights.grid.west_m) / heights.grid.cell_m - 0.5
     row = (heights.grid.north_m - y - shift[1]) / heights.grid.cell_m - 0.5
@@ -84,12 +84,12 @@ def _moved(heights: Heights, grid: MapGrid, motion: Layer) -> tuple[Layer, Layer
     return height_m - shift[2] + missing, sigma_m + missing
 
 
-def _design(grid: MapGrid, height_m: Layer) -> Layer:
+def _design(grid: MapGrid, offset: Layer, height_m: Layer) -> Layer:
     """Returns the derivatives (7, rows, cols) of the difference; noise of the gradient would bias it towards zero."""
     north, east = np.gradient(smoothed(height_m, 1.0), -grid.cell_m, grid.cell_m)
-    x, y = np.meshgrid(*grid.centres())
-    x, y = x - x.mean(), y - y.mean()
-    return np.stack([-east, -north, np.ones_like(x), y, -x, east * y - north * x, -east * x - north * y])
+    x, y, z = offset
+    turns = y + north * z, -x - east * z, east * y - north * x
+    return np.stack([-east, -north, np.ones_like(x), *turns, z - east * x - north * y])
 
 
 def _robust_fit(design: Layer, difference_m: Layer, sigma_m: Layer) -> tuple[Layer, Layer]:

@@ -26,7 +26,16 @@ from twin.estimate import Navigator
 from twin.estimate.self_check import check_survey
 from twin.estimate.stereo_vision import StereoVision
 from twin.judge.metrics import EvaluationInput
-from twin.judge.recorded import ALIGNMENTS, AlignmentName, RecordedTruth, associate, true_from_world, true_heights
+from twin.judge.recorded import (
+    ALIGNMENTS,
+    AlignmentName,
+    RecordedTruth,
+    are_comparable,
+    associate,
+    in_world,
+    true_from_world,
+    true_heights,
+)  # fmt: skip
 from twin.plugin.guard import check_loadable
 from twin.plugin.loading import ESTIMATORS, source_files
 from twin.plugin.navigator import NOTE, Estimators, navigator_of
@@ -236,7 +245,7 @@ class _Replayed:
 
     def _truth(self, result: SurveyResult, elevation: ElevationMap | None) -> RecordedTruth:
         path, true_map, alignment = self.opened.truth, self.opened.true_map, self.options.alignment
-        if path is None or true_map is None or elevation is None:
+        if path is None or true_map is None or elevation is None or not are_comparable(result.final, path):
             return RecordedTruth(path, alignment)
         moved = true_from_world(result.final, path, alignment)
         return RecordedTruth(path, alignment, true_heights(elevation, true_map, moved))
@@ -263,8 +272,8 @@ class _Replayed:
         final, path, truth = survey.result.final, survey.truth.trajectory, None
         rows = associate(final.times_s, np.zeros(0) if path is None else path.times_s)
         if path is not None and len(final) and np.array_equal(rows.estimate, np.arange(len(final))):
-            world_from_true = np.linalg.inv(true_from_world(final, path, survey.truth.alignment))
-            truth = Trajectory(final.times_s, world_from_true @ path.world_from_camera[rows.truth])
+            moved = in_world(path, final, survey.truth.alignment)
+            truth = Trajectory(final.times_s, moved.world_from_camera[rows.truth])
         return replace(written, recorded_truth=truth, recorded_heights_m=survey.truth.heights_m)
 
 

@@ -116,8 +116,8 @@ def section_lines(run: Run) -> list[Array]:
     Most of the path runs along the legs; their axis is the mean of the doubled directions of its steps.
     """
     grid, paths = run.rasters["dem"].grid, run.trajectories.values()
-    steps = np.concatenate([np.zeros((1, 2)), *(np.diff(path.positions[:, :2], axis=0) for path in paths)])
-    turned = run.keyframes.map_from_world[:2, :2] @ steps.T
+    steps = np.concatenate([np.zeros((1, 3)), *(np.diff(path.positions, axis=0) for path in paths)])
+    turned = run.keyframes.map_from_world[:2, :3] @ steps.T
     angle = 0.5 * np.arctan2((2 * turned[0] * turned[1]).sum(), (turned[0] ** 2 - turned[1] ** 2).sum())
     along = np.array([np.cos(angle), np.sin(angle)])
     west, east, south, north = extent_of(grid)

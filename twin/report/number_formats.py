@@ -14,6 +14,7 @@ UNITS = {
 _FRACTIONS = (
     "risk", "map.completeness", "overlap.", "plan.overlap_along", "plan.overlap_across",
     "consistency.within_", "orthomosaic.matched", "orthomosaic.coverage_", "self_check.frames_lost",
+    "self_check.links_failed", "vision.saturated", "map.gross", "map.floor_gross", "map.objects_gross",
 )  # fmt: skip
 
 
@@ -83,7 +84,7 @@ def metric_value(metric: str, value: float | None) -> str:
         return DASH
     if metric.endswith("_rmse_deg"):
         return milliradians(value)
-    return length(value) if metric.endswith("_m") else with_unit(metric, float(value))
+    return length(value) if metric.endswith("_m") else with_unit(metric, value)
 
 
 def is_fraction(name: str) -> bool:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from twin.core.nested import leaves
 from twin.core.user_files import resolved
 from twin.errors import TwinError
+from twin.judge.map_error import INFINITE_WITH_HOLES
 from twin.judge.verdict import more_is_better, numbers_of
 from twin.report.headline import badge, first_lines
 from twin.report.html import render_page, render_paragraphs
@@ -89,6 +90,9 @@ def names_of(runs: Sequence[Run]) -> list[str]:
 def table(runs: Sequence[Run]) -> list[Row]:
     """Returns the rows of all quantities that at least one run has."""
     numbers = [numbers_of(run.metrics or {}) for run in runs]
+    for one in numbers:
+        if one.get("map.completeness_area") is not None:
+            one |= {name: np.inf for name in INFINITE_WITH_HOLES if one.get(name) is None}
     values = {name: [one.get(name) for one in numbers] for name in QUANTITIES}
     return [
         Row(name, [_compared(name, value, found[0] if k else None) for k, value in enumerate(found)])
@@ -216,9 +220,12 @@ def height_error_curves(runs: Styled) -> Figure | None:
 
 
 def _compared(name: str, value: float | None, first: float | None) -> Cell:
-    text = metric_value(name, value)
+    text = "infinite (holes)" if value == np.inf else metric_value(name, value)
     if value is None or first is None:
-        return Cell(value, text)
+        return Cell(None if value == np.inf else value, text)
+    if np.inf in (value, first):
+        changes = ("same", "") if value == first else ("better", "good") if first == np.inf else ("worse", "bad")
+        return Cell(None if value == np.inf else value, text, None, *changes)
     difference = value - first
     if difference == 0:
         return Cell(value, text, difference, "same")

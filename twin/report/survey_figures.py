@@ -34,7 +34,7 @@ def plan_view(run: Run) -> Figure | None:
         return None
     figure, axes = one_panel(5.2)
     map_axes(axes, run)
-    if "dem_truth" in run.rasters:
+    if "dem_truth" in run.rasters and np.allclose(run.keyframes.map_from_world, np.eye(4)):
         floor = run.rasters["dem_truth"]
         axes.imshow(hillshade(subsampled(floor), "gray"), extent=extent_of(floor.grid), alpha=0.35)
     for name in ("reference", "truth", *ESTIMATES):
