@@ -126,3 +126,47 @@ def test_the_bias_of_the_gyroscope_is_found(axis):
         found.correct(geometry.inverse(cameras[0]) @ cameras[k], np.diag([1e-8] * 3 + [1e-7] * 3))
     true = geometry.adjoint(geometry.inverse(RIG.body_from_camera))[:3, :3] @ rates(times[-1])
     np.testing.assert_allclose(found.velocity[:3], true, atol=1e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [90.0, 100.0, 40.0])
+def test_the_prediction_ends_at_the_frame_also_if_no_reading_does(rate_hz):
+    """At a constant velocity of 0.5 m/s, whose readings are exact at any rate."""
+    times_s, velocity = np.arange(0, 12, 1 / rate_hz), np.array([0.5, 0.0, 0.0])
+    cov, rng, errors, to_camera = np.diag([3e-4**2] * 3 + [5e-4**2] * 3), np.random.default_rng(1), [], None
+    to_camera = RIG.body_from_camera[:3, :3].T
+    found = InertialFilter(RIG, REAL, still(times_s[:1]).until(0.0), np.zeros(6))
+    for k in range(1, 330):
+        part = times_s[(times_s > (k - 1) / FRAME_HZ + 1e-9) & (times_s <= k / FRAME_HZ + 1e-9)]
+        found.predict(1 / FRAME_HZ, still(part).until(k / FRAME_HZ))
+        true = geometry.pose(np.eye(3), to_camera @ velocity * k / FRAME_HZ)
+        if k > 100:
+            errors.append(np.linalg.norm((geometry.inverse(true) @ found.pose)[:3, 3]))
+        assert found.correct(true @ geometry.exp(np.sqrt(np.diag(cov)) * rng.standard_normal(6)), cov)
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5 * np.sqrt(np.trace(found.cov[3:, 3:])) + 3e-4
+
+
+def still(times_s):
+    return ImuReadings(times_s, np.zeros((len(times_s), 3)), np.tile([0, 0, GRAVITY_MPS2], (len(times_s), 1)))
+
+
+def test_readings_last_until_the_time_of_the_frame():
+    given = ImuReadings(np.array([1.0, 1.1]), np.arange(6.0).reshape(2, 3), np.arange(6.0, 12.0).reshape(2, 3))
+    later = given.until(1.15)
+    assert later.times_s.tolist() == [1.0, 1.1, 1.15]
+    for before, after in zip(given[1:], later[1:], strict=True):
+        np.testing.assert_array_equal(after, [*before, before[-1]])
+    assert given.until(1.1) is given and len(still(np.zeros(0)).until(2.0).times_s) == 0
+
+
+def test_an_imu_slower_than_the_camera_leaves_no_gap_but_a_silent_one_does():
+    sigmas = []
+    for n_silent in (1, 6):
+        times_s = np.arange(0, 1, 1 / RATE_HZ)
+        found = InertialFilter(RIG, REAL, still(times_s[:1]), np.zeros(6))
+        for k in range(1, 20):
+            found.predict(1 / FRAME_HZ, still(times_s[4 * k - 3 : 4 * k + 1]))
+            found.correct(np.eye(4), np.eye(6) * 1e-8)
+        for _ in range(n_silent):
+            found.predict(1 / FRAME_HZ, still(np.zeros(0)))
+        sigmas.append(np.sqrt(np.trace(found.cov[:3, :3])))
+    assert sigmas[0] < 2e-3 and sigmas[1] > 3e-2

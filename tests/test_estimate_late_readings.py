@@ -1,15 +1,20 @@
 """Late and rare readings: fused at their time, given to the next node, and bridged by vision."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import seafloor_scene as scene
 from scipy.stats import chi2
 
 from twin.core import geometry
-from twin.core.records import Readings, SensorNoise, StereoRig
+from twin.core.records import Frame, ImuErrorModel, ImuReadings, Readings, SensorNoise, StereoRig
+from twin.estimate import Navigator
 from twin.estimate.late_readings import ReadingsBetweenNodes, motion_since
 from twin.estimate.navigation.dvl import DvlIntegrator, fuse_dvl
 from twin.estimate.navigation.pose_filter import PoseFilter
 from twin.estimate.trajectory import PoseLog
+from twin.estimate.vision.inertial_filter import InertialFilter
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
@@ -189,3 +194,53 @@ def test_a_slow_dvl_that_misses_more_than_one_reading_is_incomplete():
     for k in range(1, 9):
         step(None)
         assert dvl.state.complete[0] == (k < 5), k
+
+
+def flown_with_fixes(far_off=(), every=3):
+    """Returns errors of the final path in y [m] and the number of rejected fixes; `far_off`: frames of wrong ones."""
+    rig, floor, rng = (
+        replace(scene.small_rig(160, 120), frame_rate_hz=10.0),
+        scene.plane(0.05, 0.03),
+        np.random.default_rng(0),
+    )
+    noise = SensorNoise(usbl_m=0.02)
+    with Navigator(rig, readings_noise=noise, start=scene.down_camera(0, 0, 2.0)) as navigator:
+        for k in range(10):
+            pair = scene.stereo_pair(floor, rig, scene.down_camera(0.05 * k, 0, 2.0), rng)[:2]
+            left, right = (np.repeat(image[..., None], 3, axis=2) for image in pair)
+            fix = np.array([0.05 * k, 10.0 * (k in far_off), 2.0]) if k % every == 0 or k in far_off else None
+            navigator.update(Frame(k, k / 10, left, right, Readings(usbl_m=fix), keyframe=k % 3 == 0))
+        result = navigator.finish()
+    return np.abs(result.final.positions[:, 1]).max(), result.quality.readings_rejected["usbl"]
+
+
+@pytest.mark.parametrize("far_off", [(6, 9), (5,)])
+def test_a_rejected_position_fix_is_in_no_alignment(far_off):
+    """Neither of keyframes (6, 9) nor of a frame between keyframes (5)."""
+    error_m, n_rejected = flown_with_fixes(far_off)
+    assert n_rejected == len(far_off) and error_m < 5e-3
+
+
+def test_a_frame_that_is_ignored_changes_nothing():
+    rig, left = scene.small_rig(160, 120), np.zeros((50, 160, 3), np.uint8)
+    with Navigator(rig, readings_noise=SensorNoise(usbl_m=0.1), start=scene.down_camera(0, 0, 2.0)) as navigator:
+        navigator.update(Frame(0, 0.0, np.zeros((120, 160, 3), np.uint8), None))
+        navigator.filter.cov = np.eye(6) * 0.01
+        before = navigator.filter.world_from_camera.copy()
+        late = ((0.0, Readings(usbl_m=np.array([0.2, 0.0, 2.0]))),)
+        with pytest.raises(ValueError, match="the image has 160 x 50 px"):
+            navigator.update(Frame(1, 0.1, left, None, Readings(late=late)))
+        np.testing.assert_array_equal(navigator.filter.world_from_camera, before)
+        np.testing.assert_array_equal(navigator.filter.cov, np.eye(6) * 0.01)
+
+
+def test_another_scale_of_the_images_keeps_the_inertial_filter(monkeypatch):
+    monkeypatch.setattr("twin.estimate.vision.stereo.choose_binning", lambda *_: 2)
+    rig, imu = scene.small_rig(160, 120), ImuErrorModel(1.7e-4, 2e-5, 2e-3, 3e-3, 1e-3, 1e-2)
+    pair = scene.stereo_pair(scene.plane(0.05, 0.03), rig, scene.down_camera(0, 0, 2.0), np.random.default_rng(0))[:2]
+    left, right = (np.repeat(image[..., None], 3, axis=2) for image in pair)
+    reading = ImuReadings(np.zeros(1), np.zeros((1, 3)), np.array([[0.0, 0.0, 9.81]]))
+    with Navigator(rig, readings_noise=SensorNoise(imu=imu)) as navigator:
+        navigator.update(Frame(0, 0.0, left[:, ::-1].copy(), None, Readings(imu=reading)))
+        navigator.update(Frame(1, 0.1, left, right))  # no reading
+        assert navigator.vision.binning == 2 and isinstance(navigator.vision.f2f.filter, InertialFilter)

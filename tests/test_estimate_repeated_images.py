@@ -6,10 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import recorded_datasets as recorded
+import seafloor_scene as scene
 
 from twin import survey
 from twin.core.quality import EstimationQuality
 from twin.core.records import LEFT_REPEATS, RIGHT_REPEATS, Frame, Readings, SensorNoise
+from twin.core.settings import EstimatorSettings
+from twin.estimate import Navigator
 from twin.estimate.vision.repeated_images import RepeatedImages
 from twin.recordings.replay import ReplayOptions, replay
 from twin.scenario.file import load_scenario
@@ -88,6 +91,22 @@ def test_a_vehicle_cannot_stop_between_two_frames():
     """The camera stays frozen while the predicted velocity decays."""
     found = statuses([0, 1, 1, 1], twists=[MOVING, MOVING, MOVING, REST], noisy=False)
     assert found == ["ok", "ok", LEFT_REPEATS, LEFT_REPEATS]
+
+
+def test_a_frozen_right_camera_does_not_hide_that_the_left_one_is_lost():
+    rig, floor, rng = scene.small_rig(160, 120), scene.plane(0.05, 0.03), np.random.default_rng(0)
+    frozen = []
+    with Navigator(rig, settings=EstimatorSettings(noisy_images=True)) as navigator:
+        for k in range(10):
+            pair = scene.stereo_pair(floor, rig, scene.down_camera(0.02 * k, 0, 2.0), rng)[:2]
+            left, right = (np.repeat(image[..., None], 3, axis=2) for image in pair)
+            frozen = [right, *frozen][:1] if k < 4 else frozen
+            left = rng.integers(0, 255, left.shape, dtype=np.uint8) if k >= 7 else left
+            estimate = navigator.update(Frame(k, k / 30, left, frozen[0]))
+            assert estimate.is_measured == (k < 7)
+            assert estimate.status.startswith(RIGHT_REPEATS) == (k >= 4)
+        quality = navigator.finish().quality
+    assert quality.frames_lost == 3 and sorted(len(rows) for rows in quality.repeats.values()) == [3, 3]
 
 
 def test_notes_name_the_frames():

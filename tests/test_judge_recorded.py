@@ -9,9 +9,19 @@ from evo.core import sync
 from evo.core.trajectory import PoseTrajectory3D
 
 from twin.core import geometry
-from twin.core.records import SurveyResult, Trajectory
-from twin.judge.recorded import associate, recorded_consistency, recorded_errors, rigid_alignment, truth_warnings
+from twin.core.records import StereoRig, SurveyResult, Trajectory
+from twin.judge.metrics import EvaluationInput, evaluate
+from twin.judge.recorded import (
+    RecordedTruth,
+    associate,
+    in_world,
+    recorded_consistency,
+    recorded_errors,
+    rigid_alignment,
+    truth_warnings,
+)  # fmt: skip
 from twin.judge.trajectory_errors import trajectory_metrics
+from twin.report.headline import headline
 
 RNG = np.random.default_rng(2)
 MOVED = geometry.exp(np.array([0.4, -1.1, 2.0, 5.0, -3.0, 1.0]))
@@ -208,3 +218,58 @@ def test_a_truth_that_covers_a_quarter_of_the_frames_is_named(pair):
     true = curve(times_s)
     part = Trajectory(times_s[:75], true.world_from_camera[:75])
     assert truth_warnings(true, part) == ["Only 75 of 300 frames have a true pose; errors are those of these frames."]
+
+
+def result_of(path, every):
+    rows = np.arange(0, len(path), every)
+    return SurveyResult(path, path, path, rows, np.ones_like(rows), np.tile(np.eye(6) * 1e-4, (len(rows), 1, 1)))
+
+
+def test_two_true_poses_in_another_world_judge_no_covariances():
+    path = curve(np.arange(40) / 5)
+    truth = Trajectory(path.times_s[[10, 12]], MOVED @ path.world_from_camera[[10, 12]])
+    assert recorded_consistency(result_of(path, 2), truth, "se3") == {}
+    source = {"reader": "x", "skipped": {}}
+    survey = EvaluationInput(
+        result_of(path, 2), None, RecordedTruth(truth, "se3"), StereoRig(64, 48, 50.0, 0.1, 1.0), source=source
+    )
+    assert "Too few frames have a true pose" in headline(evaluate(survey), {})
+
+
+def test_errors_have_the_axes_of_the_estimates_as_in_the_report():
+    """The true z axis lies across the heights of the estimates, whose error is in height alone."""
+    path = curve(np.arange(40) / 5)
+    poses = path.world_from_camera.copy()
+    poses[:, 2, 3] += 0.05 * np.random.default_rng(1).normal(size=40)
+    turned = geometry.exp(np.array([np.pi / 2, 0, 0, 1.0, 2.0, 3.0]))
+    estimate, truth = Trajectory(path.times_s, poses), Trajectory(path.times_s, turned @ path.world_from_camera)
+    survey = EvaluationInput(
+        result_of(estimate, 2), None, RecordedTruth(truth, "se3"), StereoRig(64, 48, 50.0, 0.1, 1.0), source={}
+    )
+    found = evaluate(survey)["trajectory"]["final"]
+    assert found["z_rmse_m"] > 5 * max(found["x_rmse_m"], found["y_rmse_m"])
+    written = in_world(truth, estimate, "se3")  # trajectory_truth.tum
+    shown = trajectory_metrics(recorded_errors(estimate, written, "se3"))
+    assert found["z_rmse_m"] == pytest.approx(shown["z_rmse_m"])
+    assert found["heading_rmse_deg"] == pytest.approx(shown["heading_rmse_deg"])
+
+
+def test_a_truth_that_covers_less_than_half_of_the_frames_has_no_other_clock():
+    path = curve(np.arange(200) / 10)
+    truth = curve(np.arange(-50, 90) / 10)
+    (warning,) = truth_warnings(path, truth)
+    assert "Only 90 of 200 frames" in warning
+
+
+def test_a_truth_interpolated_between_the_frames_is_named_where_it_judges_no_covariances():
+    rng, knots = np.random.default_rng(3), curve(np.arange(31.0))
+    truth = []
+    for k in range(600):
+        first, second = knots.world_from_camera[k // 20 : k // 20 + 2]
+        truth.append(first @ geometry.exp(k % 20 / 20 * geometry.log(geometry.inverse(first) @ second)))
+    truth = Trajectory(np.arange(600) / 20, np.array(truth))
+    poses = truth.world_from_camera[::10].copy()
+    poses[:, :3, 3] += 0.01 * rng.normal(size=(60, 3))
+    estimate = Trajectory(np.arange(60) / 2, poses)
+    assert recorded_consistency(result_of(estimate, 2), truth, "se3") == {}
+    assert any("interpolated" in warning for warning in truth_warnings(estimate, truth))

@@ -8,6 +8,7 @@ from scipy.special import ellipe
 
 from tests.test_report_comparison import write_run
 from twin import cli
+from twin.core import geometry
 from twin.core.georeference import Georeference
 from twin.core.records import MapGrid, Trajectory
 from twin.errors import TwinError
@@ -383,6 +384,67 @@ def test_twin_products_says_rugosity_with_grain_and_plane(monkeypatch, capsys, t
         page.index(first) < page.index("Can you rely on it?") < page.index("What would break it?") < page.index("<img")
     )
     assert (tmp_path / "p" / "slope.tif").is_file()
+
+
+def test_products_are_compared_with_the_truth_where_it_is_known(tmp_path):
+    true_m, known = floor(*coordinates()), coordinates()[0] < 0
+    heights = heights_with(error_field(), 1, true_m)
+    part = write_map(tmp_path / "part", heights, np.where(known, true_m, np.nan))
+    results = pages.products_of(part)
+    compared, truth = results.variables["compared"], results.variables["truth"]
+    assert compared.area_m2 == truth.area_m2 == known.sum() * CELL_M**2
+    assert abs(compared.volume_m3.value - truth.volume_m3.value) < 3 * compared.volume_m3.sigma.total
+    assert any(" m2 where it is known" in item for one in results.paragraphs for item in one.items)
+    none = pages.products_of(write_map(tmp_path / "none", heights, np.full(SHAPE, np.nan)))
+    assert none.variables["truth"] is None and none.paragraphs
+
+
+def test_a_level_true_floor_is_compared_by_its_slope_in_degrees(tmp_path):
+    level = write_map(tmp_path / "run", heights_with(error_field(), 1, np.zeros(SHAPE)), np.zeros(SHAPE))
+    items = [item for one in pages.products_of(level).paragraphs for item in one.items]
+    assert any("Compared with the true surface" in item and " deg, volume " in item for item in items)
+
+
+def test_the_height_above_a_tilted_map_is_that_along_its_axis(tmp_path):
+    tilted = geometry.exp(np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    runs = [write_map(tmp_path / name, heights_with(error_field(), 1, floor(*coordinates()))) for name in "ab"]
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 2, 3] = 2.0
+    Trajectory(np.arange(3.0), geometry.inverse(tilted) @ poses).save(runs[1] / "trajectory_final.tum")
+    (runs[1] / "keyframes").mkdir(exist_ok=True)
+    (runs[1] / "keyframes" / "index.json").write_text(json.dumps({"map_from_world": tilted.tolist()}))
+    volumes = [pages.products_of(folder).tree["volume_m3"]["sigma"] for folder in runs]
+    assert volumes[1] == pytest.approx(volumes[0], rel=1e-4)
+
+
+def test_layers_of_other_cells_are_refused(runs):
+    other = np.full((50, 50), 0.01)
+    geotiff.write_layer(runs[0] / "dem_sigma.tif", other, grid((50, 50)), "sigma")
+    with pytest.raises(TwinError, match="dem_sigma.tif has other cells than dem.tif"):
+        pages.products_of(runs[0])
+
+
+def test_where_all_cells_changed_no_share_of_false_ones_is_stated(runs):
+    true_m = floor(*coordinates()) + 0.05
+    geotiff.write_elevations(runs[1] / "dem_truth.tif", true_m.astype(np.float32), grid(), "true")
+    results = pages.change_of(*runs, 0.2)
+    assert results.tree["truth"]["false_cells"] is None
+    assert not any("of the unchanged cells" in item for one in results.paragraphs for item in one.items)
+
+
+def test_a_scale_also_acts_on_heights():
+    """A map with relief of 0.5 m, scaled by 1 % in all three axes about its centre."""
+    rng, (x, y) = np.random.default_rng(1), coordinates()
+    fx, fy = rng.uniform(2, 5, 2)
+    relief = lambda x, y: 0.5 * np.sin(fx * x) * np.cos(fy * y) + 0.1 * np.sin(9 * x + 5 * y)  # noqa: E731
+    first, k = relief(x, y), 0.01
+    xc, yc, zc = x.mean(), y.mean(), np.median(first)
+    second = zc + (1 + k) * (relief(xc + (x - xc) / (1 + k), yc + (y - yc) / (1 + k)) - zc)
+    sigma = np.full(SHAPE, 0.002)
+    found = register(Heights(grid(), first, sigma), Heights(grid(), second, sigma), np.ones(SHAPE, bool))
+    assert found.values[6] == pytest.approx(k, rel=0.02)
+    rest = np.isfinite(found.difference_m)
+    assert abs(np.polyfit(first[rest], found.difference_m[rest], 1)[0]) < 1e-3
 
 
 def test_a_run_without_map_trajectory_or_rig_has_no_products(runs):

@@ -136,3 +136,23 @@ def test_scenarios_that_differ_late_in_a_long_list_differ(tmp_path):
             file.write(f"[other]\noutline_m = [{'0.123456789, ' * 12}{last}]\n")
     differences = run_comparison.scenario_differences(run_comparison.load_runs(runs))
     assert list(differences) == ["other.outline_m"] and all(len(text) == 80 for text in differences["other.outline_m"])
+
+
+def test_an_error_that_holes_make_infinite_is_worse_than_any_other(tmp_path):
+    folders = [write_run(tmp_path / name, 0.002, 0.9, seed=1) for name in ("whole", "holes", "more")]
+    for folder, le90_m, covered, frames in zip(
+        folders, (0.01, None, None), (0.95, 0.6, 0.4), (12340, 12345, 1), strict=True
+    ):
+        metrics = json.loads((folder / "metrics.json").read_text())
+        metrics["map"] |= {"le90_area_m": le90_m, "completeness_area": covered}
+        metrics["timing"]["frames"] = frames
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+    whole, holes, more = run_comparison.load_runs(folders)
+    first, second = row([whole, holes], "map.le90_area_m")
+    assert (second.text, second.change, second.level, second.value) == ("infinite (holes)", "worse", "bad", None)
+    first, second = row([holes, whole], "map.le90_area_m")
+    assert (second.text, second.change, second.level) == ("1.0 cm", "better", "good")
+    assert row([holes, more], "map.le90_area_m")[1].change == "same"
+    assert [cell.text for cell in row([whole, holes], "timing.frames")] == ["12340", "12345"]
+    text = json.dumps(run_comparison.as_json([whole, holes]), allow_nan=False)
+    assert "infinite" not in text and "of the asked area" in run_comparison.render([whole, holes])

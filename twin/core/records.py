@@ -178,6 +178,12 @@ class ImuReadings(NamedTuple):
     rates_radps: Array  #: (n, 3) angular rates of the body in its own axes [rad/s]
     specific_forces_mps2: Array  #: (n, 3) specific forces [m/s2]
 
+    def until(self, time_s: float) -> "ImuReadings":
+        """Returns the readings with the last one once more at a later time [s]; as they are without any."""
+        if not len(self.times_s) or self.times_s[-1] >= time_s:
+            return self
+        return ImuReadings(np.append(self.times_s, time_s), *(np.vstack([part, part[-1:]]) for part in self[1:]))
+
 
 @dataclass(frozen=True)
 class Readings:
@@ -222,7 +228,8 @@ class Frame:
 
 #: Statuses of a frame at which a camera is frozen; with the left camera alone, the motion is still measured.
 LEFT_REPEATS, RIGHT_REPEATS = "the left camera repeats its image", "the right camera repeats its image"
-REPEATS = LEFT_REPEATS, RIGHT_REPEATS
+RIGHT_REPEATS_BLIND = f"{RIGHT_REPEATS}, and the motion could not be measured in the left one"
+REPEATS = LEFT_REPEATS, RIGHT_REPEATS, RIGHT_REPEATS_BLIND
 NO_STEREO = "too few points in stereo"  #: status of a frame that could not become a keyframe
 
 

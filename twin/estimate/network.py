@@ -287,7 +287,7 @@ class KeyframeNetwork:
         links = self.links.select(self.links.j >= first)
         fixed = set(links.i[links.i < first].tolist())
         everyone = [k for k in self.nodes if k.number in fixed] + nodes
-        anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: self.reference_cov}
+        anchors = dict.fromkeys(fixed, _FIXED_COV) if first else {0: self.reference_cov}
         start_s = time.perf_counter()
         yaw = self.disparity_offset(self.history.yaws.array, len(self.nodes) - 1) if self.rig.yaw_sigma_rad else None
         measured = MeasuredErrors(yaw, self._row_pattern())

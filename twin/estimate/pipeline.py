@@ -149,9 +149,9 @@ class Navigator(AbstractContextManager["Navigator"]):
             OSError: images could not be read or written.
         """
         interval_s = self.interval_s(frame.time_s)
+        motion, status = self.vision.track_frame(frame)  # before a frame that is ignored changes anything
         self._fuse_late(frame.readings.late)
         frame = replace(frame, readings=self._watch.fresh(frame.readings, frame.time_s))
-        motion, status = self.vision.track_frame(frame)
         measured = is_measured(status)
         self.log.n_lost += not measured
         last, rejected = self.filter.world_from_camera, self.filter.rejected
@@ -171,17 +171,18 @@ class Navigator(AbstractContextManager["Navigator"]):
             self._blind_frames.append(blind_frame(len(self.log), since_node, moved_since, frame.readings, guessed))
         step = motion.a_from_b if measured else geometry.inverse(last) @ self.filter.world_from_camera
         self._blind, n_keyframes = None if measured else blind, len(self.network.keyframes)
-        if status in REPEATS:
+        if repeats := status in REPEATS:
             self.log.repeats.setdefault(status, []).append(len(self.log))
-            self.filter.fuse_position_fixes(frame.readings)
-        elif self.is_keyframe(frame, status):
-            status = self._add_keyframe(frame, track, status)
+        if not repeats and self.is_keyframe(frame, status):
+            status, readings = self._add_keyframe(frame, track, status)
+        else:
+            readings = self.filter.fuse_position_fixes(frame.readings)
         online, f2f = self.filter.world_from_camera.copy(), self.filter.f2f
         if measured and blind is not None:
             self.log.append_after(blind.rows.start, frame.time_s, f2f, online, motion.a_from_b)
         else:
             self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
-        self._between.keep(frame.time_s, frame.readings)
+        self._between.keep(frame.time_s, readings)
         self._between.give_to_nodes(self.network.nodes, self.log)
         if not measured and len(self.network.keyframes) > n_keyframes:
             self._blind = None  # tracking continues from the new keyframe
@@ -244,14 +245,14 @@ class Navigator(AbstractContextManager["Navigator"]):
         next_pair = self.filter.world_from_camera @ since_pair
         return self.network.overlap(self.network.keyframes[-1], next_pair) < self.settings.keyframe_overlap
 
-    def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
+    def _add_keyframe(self, frame: Frame, track: int, status: str) -> tuple[str, Readings]:
         """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking."""
-        # returns `status`, or why the frame did not become a keyframe (only position fixes are then fused); with
-        # `wide_search`, "ok" if the link from the last node measures the motion although tracking failed
+        # returns `status`, or why the frame did not become a keyframe (only position fixes are then fused), and the
+        # readings that were not rejected; with `wide_search`, the status is "ok" if the link from the last node
+        # measures the motion although tracking failed
         points = self.vision.observe_stereo(frame, len(self.log))
         if points is None:
-            self.filter.fuse_position_fixes(frame.readings)
-            return NO_STEREO
+            return NO_STEREO, self.filter.fuse_position_fixes(frame.readings)
         if (tracking_cov := self.vision.tracking_cov()) is not None:
             self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(tracking_cov[3:, 3:]))))
         velocity = None  # measured otherwise than by tracking
@@ -280,7 +281,7 @@ class Navigator(AbstractContextManager["Navigator"]):
         if is_node:
             self._connect(keyframe, attempt)
         self.vision.restart_tracking(velocity)
-        return status
+        return status, keyframe.readings
 
     def _measured_velocity(self, time_s: float, chain: Link) -> Array:
         """Returns the mean velocity (6,) since the last node by the link from it, which also becomes part of F2F."""

@@ -11,10 +11,11 @@ from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import (
     LEFT_REPEATS,
+    RIGHT_REPEATS,
+    RIGHT_REPEATS_BLIND,
     ElevationMap,
     Frame,
     Image,
-    ImuReadings,
     Map,
     MapGrid,
     SensorNoise,
@@ -105,7 +106,10 @@ class StereoVision(AbstractContextManager["StereoVision"]):
             interval_s = frame.time_s - last_s if frame.time_s > last_s else None
             frozen = self.repeats.status(frame, self.f2f.filter.velocity, interval_s or 1 / self.rig.frame_rate_hz)
             unusable, imu = frozen if frozen == LEFT_REPEATS else "", frame.readings.imu
+            imu = None if imu is None else imu.until(frame.time_s)
             motion, status = self.f2f.step(self._image, interval_s, unusable, imu)
+            if frozen == RIGHT_REPEATS and status != "ok":
+                frozen = RIGHT_REPEATS_BLIND
             return motion, status if frozen == "ok" else frozen
 
     def _set_image(self, left: Image) -> None:
@@ -117,7 +121,7 @@ class StereoVision(AbstractContextManager["StereoVision"]):
         left, right = (matching.scaled_rows(image, self._row_scale) for image in (frame.left, frame.right))
         with self.stopwatch("stereo"):
             if self._points is None:
-                self._choose_scale(left, right, frame.readings.imu)
+                self._choose_scale(left, right)
             corrected, gray, dense, points = self._match_pair(left, right, row)
             if len(points.xyz) >= _MIN_POINTS:
                 self.calibration.add(points, self.rig, self.settings.patch_px)
@@ -137,14 +141,15 @@ class StereoVision(AbstractContextManager["StereoVision"]):
         far_enough_px = np.where(dense.best_px > 1.0, dense.best_px, np.nan)
         return np.asarray(self.rig.focal_px * self.rig.baseline_m / far_enough_px, np.float32)
 
-    def _choose_scale(self, left: Image, right: Image, imu: ImuReadings | None) -> None:
+    def _choose_scale(self, left: Image, right: Image) -> None:
         """Chooses the binning from a stereo pair before the first keyframe; a change reprocesses the left image."""
         binning = stereo.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
+            before = self.f2f
             self._configure(binning)
             self._set_image(left)
-            self.f2f.step(self._image, imu=imu)
+            self.f2f.filter, self.f2f.started = before.filter, before.started
 
     def _match_pair(self, left: Image, right: Image, row: int) -> tuple[Image, matching.Gray, DenseMatch, StereoPoints]:
         """Returns the right image without known rectification errors, its grey levels, disparity, and points."""

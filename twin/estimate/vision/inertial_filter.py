@@ -39,6 +39,7 @@ class InertialFilter:
         twist, force = self._to_body @ velocity, first.specific_forces_mps2.mean(axis=0)
         self._state = np.concatenate([twist[3:], -force, np.zeros(6)])
         self._rate, self._force, self._last_s = first.rates_radps[-1].copy(), force, float(first.times_s[-1])
+        self._reading_s = self._last_s
         cov = np.zeros((18, 18))
         cov[_VELOCITY, _VELOCITY] = np.eye(3) * _FIRST_VELOCITY**2
         cov[_RATE_BIAS, _RATE_BIAS] = np.eye(3) * noise.rate_bias**2
@@ -67,16 +68,16 @@ class InertialFilter:
 
     def predict(self, interval_s: float, imu: ImuReadings | None = None) -> None:
         """Predicts the pose of the next frame from the readings up to its time; without any, the motion continues."""
-        end_s = self._last_s + interval_s
+        end_s, is_gap = self._last_s + interval_s, imu is None
         times_s, rates, forces = np.array([end_s]), self._rate[None], self._force[None]
         if imu is not None and len(imu.times_s):
-            end_s = float(imu.times_s[-1])
+            end_s = self._reading_s = float(imu.times_s[-1])
             times_s, rates, forces = (np.ascontiguousarray(part, np.float64) for part in imu)
         n = self._noise
         noise = n.rate_density**2, n.rate_walk**2, n.force_density**2, n.force_walk**2
         self._pose, self._state, self._cov = _propagate(
             self._pose, self._state, self._cov, self._last_s, self._rate, self._force, times_s, rates, forces, noise,
-            imu is None,
+            is_gap or end_s - self._reading_s > _LONGEST_S,
         )  # fmt: skip
         self._rate, self._force, self._last_s = rates[-1].copy(), forces[-1].copy(), end_s
         self._fix_gravity()
