@@ -57,14 +57,10 @@ class CameraSurface:
 
 
 def surface_above_floor(
-    height_at: Callable[[Array, Array], Array],
-    area: SurveyArea,
-    spacing_m: float,
-    altitude_m: float,
-    footprint_m: tuple[float, float],
-    max_slope: tuple[float, float],
+    height_at: Callable[[Array, Array], Array], area: SurveyArea, spacing_m: float, altitude_m: float,
+    footprint_m: tuple[float, float], max_slope: tuple[float, float],
     least_at: Callable[[Array, Array], Array] | None = None,
-) -> CameraSurface:
+) -> CameraSurface:  # fmt: skip
     """Returns the surface that the camera follows at an altitude above the smoothed floor.
 
     The floor is averaged twice over the footprint, along u and v, and sampled at nodes about 1/8 of the shorter side of

@@ -100,13 +100,11 @@ def _vertical_axis(source: rasterio.DatasetReader, horizontal: Part, vertical: P
         raise height_error(file, f"has a CRS in units of {unit_m:.7g} m, and no unit of its heights", remedy)
     return VerticalAxis(
         direction if direction in ("up", "down") else cf_direction(tags),
-        unit_length_m(unit, file) if unit else _axis_unit_m(vertical),
-        next(filter(None, names), ""),
+        unit_length_m(unit, file) if unit else _axis_unit_m(vertical), next(filter(None, names), ""),
         (file.stem, *names, *(file_tags.get(key, "") for key in _FILE_TAGS)),
-        "" if vertical is None else str(vertical["name"]),
-        source.crs is not None,
+        "" if vertical is None else str(vertical["name"]), source.crs is not None,
         "vertical CRS or unit of the band" if vertical is not None else "unit of the band" if unit else ASSUMED,
-    )
+    )  # fmt: skip
 
 
 def _output_crs(crs: CRS | None, horizontal: Part, vertical: Part) -> str | None:

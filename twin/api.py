@@ -134,13 +134,9 @@ def vehicle(
 
 
 def look(
-    scene: str | Path | Scenario,
-    at_m: tuple[float, float, float] | None = None,
-    sheet: str | Path | None = None,
-    overrides: Overrides = (),
-    twist_body: Array | None = None,
-    **sections: Any,
-) -> ViewLayers:
+    scene: str | Path | Scenario, at_m: tuple[float, float, float] | None = None, sheet: str | Path | None = None,
+    overrides: Overrides = (), twist_body: Array | None = None, **sections: Any,
+) -> ViewLayers:  # fmt: skip
     """Returns the stereo pair at one position, and every layer of light in its left image.
 
     Args:

@@ -247,11 +247,10 @@ def light(
     out: OutFolder = Path("runs/light"),
     quick: Quick = False,
     walks: Annotated[int, option("Largest number of random walks for a value of light.", min=64)] = 1_500_000,
-    phase: Annotated[
-        str, option("Phase function for lamps, in model and reference: a value of water.phase_function.")
-    ] = "sea",
+    phase: Annotated[str, option(
+        "Phase function for lamps, in model and reference: a value of water.phase_function.")] = "sea",
     as_json: SummaryJson = False,
-) -> None:
+) -> None:  # fmt: skip
     """Compare the light of lamps and sun in the images with a Monte Carlo simulation of any order of scattering."""
     from twin.reproduce.light import compare
 
@@ -321,17 +320,14 @@ def chapter(
 
 @app.command("fit-surrogate")
 def fit_surrogate(
-    files: Annotated[
-        list[str] | None, argument("Studies of rendered surveys. Default: the built-in ones.", "FILE")
-    ] = None,
-    out: Annotated[Path, option("Error model to write (TOML), for the key imaging.error_model.")] = Path(
-        "error_model.toml"
-    ),
-    runs: Annotated[Path, option("Folder of the rendered surveys; finished ones are reused.")] = Path(
-        "runs/fit-surrogate"
-    ),
+    files: Annotated[list[str] | None, argument(
+        "Studies of rendered surveys. Default: the built-in ones.", "FILE")] = None,
+    out: Annotated[Path, option(
+        "Error model to write (TOML), for the key imaging.error_model.")] = Path("error_model.toml"),
+    runs: Annotated[Path, option(
+        "Folder of the rendered surveys; finished ones are reused.")] = Path("runs/fit-surrogate"),
     jobs: Jobs = None,
-) -> None:
+) -> None:  # fmt: skip
     """Fit the error model of the surrogate to rendered surveys; finished surveys are reused."""
     from twin.app import fit_command
 
@@ -348,33 +344,22 @@ def _add_study_command(name: str, text: str, verify_text: str) -> None:
         file: Annotated[str, argument("Study: a name in scenes/studies/ or the path of a TOML file.", "FILE")],
         out: Annotated[Path | None, option(f"Folder to write. Default: runs/{name}-NAME.")] = None,
         jobs: Jobs = None,
-        scheduler: Annotated[
-            str | None,
-            option(
-                "Run on the Dask cluster at this address, e.g. tcp://host:8786, or on new SLURM jobs with the "
-                "word slurm.",
-                "ADDRESS",
-            ),
-        ] = None,
-        resume: Annotated[
-            bool, option("Run only surveys that are missing in the folder or failed.", flag="--resume")
-        ] = False,
+        scheduler: Annotated[str | None, option(
+            "Run on the Dask cluster at this address, e.g. tcp://host:8786, or on new SLURM jobs with the word slurm.",
+            "ADDRESS")] = None,
+        resume: Annotated[bool, option(
+            "Run only surveys that are missing in the folder or failed.", flag="--resume")] = False,
         live: Annotated[bool, option("Print a line for each finished survey.", flag="--live")] = False,
         as_json: SummaryJson = False,
         verify: Annotated[int | None, option(verify_text, "N", min=0, max=1000)] = None,
-        render_refused: Annotated[
-            bool,
-            option(
-                "Fly rendered what only the surrogate refuses. Default: these results are unknown.",
-                flag="--render-refused",
-            ),
-        ] = False,
-        budget: Annotated[
-            str | None, option("Stop the surveys after this time, e.g. 45m or 2h; --resume continues.", "TIME")
-        ] = None,
+        render_refused: Annotated[bool, option(
+            "Fly rendered what only the surrogate refuses. Default: these results are unknown.",
+            flag="--render-refused")] = False,
+        budget: Annotated[str | None, option(
+            "Stop the surveys after this time, e.g. 45m or 2h; --resume continues.", "TIME")] = None,
         extrapolate: Extrapolate = False,
         allow_plugins: AllowPlugins = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         from twin.app import study_command
 
         options = study_command.StudyOptions(
@@ -397,66 +382,44 @@ _add_study_command(
 
 @app.command()
 def replay(
-    dataset: Annotated[
-        Path, argument("Stereo data set: EuRoC/ASL, KITTI, left/ and right/, or a ROS 2 bag (MCAP, db3).", "DATASET")
-    ],
-    calibration: Annotated[
-        Path | None, option("OpenCV, Kalibr, ROS, ORB-SLAM3, or COLMAP cameras.txt.", "FILE")
-    ] = None,
-    truth: Annotated[
-        Path | None,
-        option(
-            "True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
-            "FILE|TOPIC",
-        ),
-    ] = None,
-    align: Annotated[
-        str, option("Alignment with the truth before the comparison: first, se3 or none.", "NAME")
-    ] = "first",
+    dataset: Annotated[Path, argument(
+        "Stereo data set: EuRoC/ASL, KITTI, left/ and right/, or a ROS 2 bag (MCAP, db3).", "DATASET")],
+    calibration: Annotated[Path | None, option(
+        "OpenCV, Kalibr, ROS, ORB-SLAM3, or COLMAP cameras.txt.", "FILE")] = None,
+    truth: Annotated[Path | None, option(
+        "True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
+        "FILE|TOPIC")] = None,
+    align: Annotated[str, option(
+        "Alignment with the truth before the comparison: first, se3 or none.", "NAME")] = "first",
     bayer: Annotated[str | None, option("Raw images: RGGB, GRBG, GBRG or BGGR.", "PATTERN")] = None,
     out: Annotated[Path | None, option("Folder to write (--preview: PNG). Default: runs/NAME-replay.")] = None,
-    preview: Annotated[
-        bool, option("Only draw the first stereo pair: matches, disparity, light before and after.", flag="--preview")
-    ] = False,
-    topics: Annotated[
-        str | None, option("Image topics of a ROS 2 bag. Default: its only stereo pair.", "LEFT,RIGHT")
-    ] = None,
-    estimator: Annotated[
-        str | None,
-        option(
-            "Estimator of another package, module:Class or its entry point. Default: the estimators of the twin.",
-            "NAME",
-        ),
-    ] = None,
-    aiding: Annotated[
-        bool, option("Use recorded readings of pressure, attitude and DVL.", flag="--aiding/--no-aiding")
-    ] = True,
-    imu: Annotated[
-        bool, option("Predict the motion between frames by the recorded IMU, which is at the origin of the body.")
-    ] = False,
-    true_map: Annotated[
-        Path | None,
-        option("True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.", "FILE"),
-    ] = None,
-    rotation_sigma: Annotated[
-        float | None,
-        option(
-            "Standard deviation of the rotation between the cameras since the calibration; estimates the yaw.", "DEG"
-        ),
-    ] = None,
-    frames: Annotated[
-        str | None, option("Frames of the data set to use, numbered from 0. Default: all.", "FIRST:END[:STEP]")
-    ] = None,
-    baseline_sigma: Annotated[
-        float | None, option("The same of the distance between the cameras; estimates the baseline.", "MM")
-    ] = None,
+    preview: Annotated[bool, option(
+        "Only draw the first stereo pair: matches, disparity, light before and after.", flag="--preview")] = False,
+    topics: Annotated[str | None, option(
+        "Image topics of a ROS 2 bag. Default: its only stereo pair.", "LEFT,RIGHT")] = None,
+    estimator: Annotated[str | None, option(
+        "Estimator of another package, module:Class or its entry point. Default: the estimators of the twin.",
+        "NAME")] = None,
+    aiding: Annotated[bool, option(
+        "Use recorded readings of pressure, attitude and DVL.", flag="--aiding/--no-aiding")] = True,
+    imu: Annotated[bool, option(
+        "Predict the motion between frames by the recorded IMU, which is at the origin of the body.")] = False,
+    true_map: Annotated[Path | None, option(
+        "True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.", "FILE")] = None,
+    rotation_sigma: Annotated[float | None, option(
+        "Standard deviation of the rotation between the cameras since the calibration; estimates the yaw.",
+        "DEG")] = None,
+    frames: Annotated[str | None, option(
+        "Frames of the data set to use, numbered from 0. Default: all.", "FIRST:END[:STEP]")] = None,
+    baseline_sigma: Annotated[float | None, option(
+        "The same of the distance between the cameras; estimates the baseline.", "MM")] = None,
     baseline: Annotated[float | None, option("Distance between the cameras. Default: the calibration's.", "M")] = None,
     field: Annotated[float | None, option("Horizontal field of view of the rectified images.", "DEG")] = None,
     resume: Resume = False,
     checkpoint_s: CheckpointS = None,
     as_json: MetricsJson = False,
     allow_plugins: AllowPlugins = False,
-) -> None:
+) -> None:  # fmt: skip
     """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
     from twin.recordings import replay as recorded
     from twin.scenario.file import plugin_error

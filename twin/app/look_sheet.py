@@ -83,13 +83,9 @@ def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
 
 
 def _light(
-    title: str,
-    unit: str,
-    layer: NDArray[np.float32],
-    gain: float,
-    linear: bool = True,
+    title: str, unit: str, layer: NDArray[np.float32], gain: float, linear: bool = True,
     percentile: float = SHOWN_PERCENTILE,
-) -> Panel:
+) -> Panel:  # fmt: skip
     """Returns the colour panel of one light component (H, W, 3); black where its `percentile` is not positive."""
     # A component whose `percentile` lies between half and full scale is shown as in the image. Any other is scaled so
     # that it is white, by the factor in the note (for gain 0, not in the image: the value shown as white).

@@ -120,12 +120,9 @@ def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, t
 
 
 def _truth(
-    mission: Mission,
-    frame: RecordedFrame,
-    view: DecomposedImage,
-    world_from_camera: Array,
+    mission: Mission, frame: RecordedFrame, view: DecomposedImage, world_from_camera: Array,
     compared: tuple[Image, bool | None],
-) -> FrameTruth:
+) -> FrameTruth:  # fmt: skip
     """Returns the layers of one frame, without `flow_px` and `clean`, which the caller replaces."""
     # `view` is the left image, rendered again; `compared` the recorded one, and `FrameTruth.identical`
     recorded, identical = compared

@@ -170,18 +170,15 @@ def rows(limits: VehicleLimits) -> list[tuple[str, str]]:
         ]
     return [
         *([] if limits.voltage_v is None else [("supply voltage", f"{limits.voltage_v:g} V")]),
-        ("controller", limits.controller),
-        ("net buoyancy", f"{limits.buoyancy_n:+.1f} N"),
+        ("controller", limits.controller), ("net buoyancy", f"{limits.buoyancy_n:+.1f} N"),
         ("righting moment", f"{limits.righting_nm_per_deg:.3f} N m per degree"),
-        ("top speed", of_axes(limits.speeds_mps, "m/s", 2)),
-        ("full force", of_axes(limits.forces_n, "N", 0)),
+        ("top speed", of_axes(limits.speeds_mps, "m/s", 2)), ("full force", of_axes(limits.forces_n, "N", 0)),
         *own[:-1],
         ("busiest thruster", f"{percent(limits.load)} of its thrust at {limits.speed_mps:g} m/s in the mean current"),
         ("stopping distance", f"{length(limits.stopping_m)} at full thrust, {length(limits.coasting_m)} without"),
-        ("latency", f"stable up to {limits.latency_s:.2f} s from image to command"),
-        own[-1],
+        ("latency", f"stable up to {limits.latency_s:.2f} s from image to command"), own[-1],
         ("this survey", f"{survey_min:.1f} min, {limits.survey_wh:.1f} W h, {limits.dives} dive(s)"),
-    ]
+    ]  # fmt: skip
 
 
 def as_json(limits: VehicleLimits, picture: str) -> dict[str, Any]:

@@ -113,13 +113,9 @@ class Aiding:
         return None if first == last else ImuReadings(*(part[first:last] for part in self._imu))
 
     def start(
-        self,
-        frames: Iterable[Frame],
-        rig: StereoRig,
-        settings: EstimatorSettings,
-        over_plane: Array,
+        self, frames: Iterable[Frame], rig: StereoRig, settings: EstimatorSettings, over_plane: Array,
         known: Array | None = None,
-    ) -> Start | None:
+    ) -> Start | None:  # fmt: skip
         """Returns the start that fits the first readings of gravity and height; None without attitude and vertical.
 
         The motion over the first frames is estimated from the images alone. With it, each attitude gives a rotation of

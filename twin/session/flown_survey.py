@@ -104,13 +104,10 @@ class FlownSurvey:
     def record(self, survey: EvaluationInput, written: SurveyRecord) -> SurveyRecord:
         mission = self.mission
         return replace(
-            written,
-            simulated=PlannedTruth(self.truth, mission.grid, mission.start),
-            n_frames_per_keyframe=mission.plan.n_frames_per_keyframe,
-            georeference=mission.terrain.georeference,
-            has_orthomosaic=survey.orthomosaic is not None,
-            tasks=survey.tasks,
-        )
+            written, simulated=PlannedTruth(self.truth, mission.grid, mission.start),
+            n_frames_per_keyframe=mission.plan.n_frames_per_keyframe, georeference=mission.terrain.georeference,
+            has_orthomosaic=survey.orthomosaic is not None, tasks=survey.tasks,
+        )  # fmt: skip
 
 
 def plugin_notes(scenario: Scenario) -> list[str]:

@@ -41,12 +41,10 @@ def fins_of(vehicle: VehicleConfig, timestep_s: float) -> Fins:
         position_m=np.array([fin.position_m for fin in fins], float).reshape(n, 3),
         normal=np.column_stack([np.cos(direction), np.sin(direction)]),
         coefficient=np.array([WATER_KG_M3 / 2 * fin.area_m2 * fin.lift_slope_per_rad for fin in fins]),
-        stall_rad=np.radians([fin.stall_deg for fin in fins]),
-        max_rad=np.radians([fin.max_deg for fin in fins]),
-        keep=np.array([math.exp(-timestep_s / fin.lag_s) for fin in fins]),
-        commanded_rad=np.zeros(n),
+        stall_rad=np.radians([fin.stall_deg for fin in fins]), max_rad=np.radians([fin.max_deg for fin in fins]),
+        keep=np.array([math.exp(-timestep_s / fin.lag_s) for fin in fins]), commanded_rad=np.zeros(n),
         angle_rad=np.zeros(n),
-    )
+    )  # fmt: skip
 
 
 @kernel

@@ -75,13 +75,10 @@ class NavigationSensors:
             fix = self._acoustic_fix(time_s, world_from_camera[:3, 3])
             beacons = self._detect_beacons(world_from_camera, depth_m()) if "beacons" in aiding else None
         return Readings(
-            pressure_z_m=None if np.isnan(height) else height,
-            ahrs_rpy_rad=None if np.isnan(angles).any() else angles,
-            dvl_mps=None if np.isnan(velocity).any() else velocity,
-            usbl_m=fix if "usbl" in aiding else None,
-            beacons=beacons,
-            imu=None if self._imu is None else self._imu.read(),
-        )
+            pressure_z_m=None if np.isnan(height) else height, ahrs_rpy_rad=None if np.isnan(angles).any() else angles,
+            dvl_mps=None if np.isnan(velocity).any() else velocity, usbl_m=fix if "usbl" in aiding else None,
+            beacons=beacons, imu=None if self._imu is None else self._imu.read(),
+        )  # fmt: skip
 
     def draw_noise(self, n_frames: int) -> tuple[Array, Array]:
         """Samples standard normal numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the DVL.

@@ -32,12 +32,9 @@ class Restore(Protocol):
 
 
 def orthomosaic(
-    views: Views,
-    elevation: ElevationMap,
-    rig: StereoRig,
-    restore: Restore | None = None,
+    views: Views, elevation: ElevationMap, rig: StereoRig, restore: Restore | None = None,
     progress: Callable[[float], None] = lambda _: None,
-) -> Iterator[OrthoTile]:
+) -> Iterator[OrthoTile]:  # fmt: skip
     """Yields all tiles of the orthomosaic, row by row from the north-west, also those without any colour.
 
     The pixels divide the cells of the map and are not larger than the median ground sample distance of the images.

@@ -35,11 +35,9 @@ def _readings(nodes: Sequence[Keyframe], name: str) -> tuple[NDArray[np.int64], 
 
 
 def _factors(
-    index: NDArray[np.int64],
-    information: Array,
-    residuals: Callable[[Array], Array],
+    index: NDArray[np.int64], information: Array, residuals: Callable[[Array], Array],
     jacobians: Callable[[Array, Array], Array],
-) -> UnaryFactors:
+) -> UnaryFactors:  # fmt: skip
     """Returns factors with the same information matrix (d, d)."""
     return UnaryFactors(index, np.tile(information, (len(index), 1, 1)), residuals, jacobians)
 
