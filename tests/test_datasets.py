@@ -350,6 +350,9 @@ def test_kitti_truth_of_camera_0_becomes_that_of_the_left_colour_camera(tmp_path
 def test_times_of_a_plain_folder_come_from_its_list_or_from_the_names(tmp_path):
     recorded.write_folder(tmp_path / "a", frames_of(3))
     assert [frame.time_s for frame in read_dataset(tmp_path / "a")[0].images] == pytest.approx([100, 100.2, 100.4])
+    (tmp_path / "a" / "times.txt").write_text("".join(f"{1_500_000_000_000 + 50 * k}\n" for k in range(3)))
+    times_s = [frame.time_s for frame in read_dataset(tmp_path / "a")[0].images]  # milliseconds
+    np.testing.assert_allclose(times_s, 1.5e9 + 0.05 * np.arange(3), rtol=1e-15)
     (tmp_path / "a" / "times.txt").write_text("1\n2\n")
     with pytest.raises(TwinError, match=r"times.txt: has 2 times .*3, one per image"):
         read_dataset(tmp_path / "a")

@@ -116,6 +116,11 @@ FLAT = ["terrain.kind=flat", "terrain.relief_m=0", "terrain.size_m=[40,40]", "ob
             "map.cell_m",
         ),
         (["waves.fetch_m=1000", "sun.depth_m=30"], "waves.wind_mps: missing, as there is a waves.fetch_m"),
+        (
+            ["waves.fetch_m=1000", "waves.wind_mps=9", "waves.period_s=5", "sun.depth_m=30"],
+            "waves.period_s: is unused: it follows from waves.wind_mps",
+        ),
+        (["vehicle.dynamics=kinematic", "current.gust_vertical_mps=0.2"], "current.gust_vertical_mps: has no effect"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused(overrides, error):

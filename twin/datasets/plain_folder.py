@@ -62,12 +62,12 @@ def _natural_order(name: str) -> list[tuple[int, int | str]]:
 
 def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
     """Returns the times of the images [s], from times.txt, else from their names, and notes on assumptions."""
-    # names: seconds with a decimal point, or an integer in one of `_UNITS` since 1970; else 1 frame per second
+    # seconds, in names with a decimal point, or whole numbers in one of `_UNITS` since 1970; else 1 frame per second
     if file.exists():
-        times_s = read_table(file, 1)[:, 0].tolist()
+        times_s = read_table(file, 1)[:, 0]
         if len(times_s) != len(names):
             raise TwinError(str(file), f"has {len(times_s)} times", f"{len(names)}, one per image")
-        return times_s, ()
+        return (times_s * _UNITS.get(len(f"{times_s[0]:.0f}"), 1.0)).tolist(), ()
     if all(re.fullmatch(r"\d+\.\d+", name) for name in names):
         return [float(name) for name in names], ()
     lengths = {len(name) for name in names if name.isdecimal()}

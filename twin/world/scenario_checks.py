@@ -153,10 +153,13 @@ def _of_sea(scenario: Scenario) -> Iterator[TwinError]:
     current, waves = scenario.current, scenario.waves
     if scenario.vehicle.dynamics == "kinematic":
         problem, allowed = "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
-        sea = ("velocity_mps", "gust_mps", "tide_mps", "file")
+        sea = ("velocity_mps", "gust_mps", "tide_mps", "file", *["gust_vertical_mps"] * bool(current.gust_vertical_mps))
         yield from keys_without_effect("current", current, sea, problem, allowed)
         yield from keys_without_effect("waves", waves, ("height_m", "wind_mps"), problem, allowed)
         yield from keys_without_effect("tether", scenario.tether, ("length_m",), problem, allowed)
+    if waves.wind_mps is not None:
+        problem = "is unused: it follows from waves.wind_mps and fetch_m"
+        yield from keys_without_effect("waves", waves, ("period_s",), problem, "one of the two")
     if current.file is not None:
         problem = "is unused: current.file has the mean current"
         yield from keys_without_effect("current", current, ("velocity_mps", "profile"), problem, "one of the two")
