@@ -92,7 +92,8 @@ def _brightest(source: rasterio.DatasetReader, bands: list[int]) -> int:
     if bits := source.tags(bands[0], ns="IMAGE_STRUCTURE").get("NBITS"):
         return 2 ** int(bits) - 1
     shape = (len(bands), min(source.height, _MOST_SAMPLED), min(source.width, _MOST_SAMPLED))
-    return int(np.percentile(source.read(bands, out_shape=shape), 99.9))
+    values = source.read(bands, out_shape=shape, masked=True).compressed()  # without nodata
+    return int(np.percentile(values, 99.9)) if values.size else 0
 
 
 def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:

@@ -49,14 +49,14 @@ def read_raster_heights(file: Path, height_spacing_m: float, driver: str = "GTif
             spacing_m = float(source.transform.a * factor)
             wkt = _output_crs(source.crs, horizontal, vertical)
             georeference = Georeference(*_centre(source), 0.0, wkt, factor, axis.datum)
-        values, doubts = _values(source, file)
+        values, doubts = _values(source, file, axis.metres_per_unit)
         name = "" if horizontal is None else str(horizontal["name"])
         nodata = "" if source.nodatavals[0] is None else f"{source.nodatavals[0]:g}"
         nodata = " and ".join(filter(None, [nodata, "the second band" if source.count == 2 else ""]))
         return HeightFile(values, spacing_m, axis, georeference, name, ground_scale, nodata, tuple(doubts))
 
 
-def _values(source: rasterio.DatasetReader, file: Path) -> tuple[NDArray[np.float64], list[str]]:
+def _values(source: rasterio.DatasetReader, file: Path, unit_m: float) -> tuple[NDArray[np.float64], list[str]]:
     """Returns the heights (rows, cols), scaled and offset as stated, NaN in holes; and the doubts about holes."""
     scale, offset = source.scales[0], source.offsets[0]
     if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
@@ -69,7 +69,7 @@ def _values(source: rasterio.DatasetReader, file: Path) -> tuple[NDArray[np.floa
             raise height_error(file, "has a second band that is not a mask")
         values[~(alpha > 0)] = np.nan
     remedy = "gdal_edit.py -a_nodata {} " if source.driver == "GTiff" else "gdal_translate -a_nodata {} -of GTiff "
-    doubts = check_no_undeclared_holes(values, file, remedy + file.name)
+    doubts = check_no_undeclared_holes(values, file, remedy + file.name, abs(scale) * unit_m)
     return values * scale + offset, doubts
 
 

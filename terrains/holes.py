@@ -12,11 +12,13 @@ _NODATA = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0, 32767.0, 6553
 #: Holes are small if they are enclosed, and no node in them is farther than this many grid spacings from a height. So
 #: are gaps between scattered heights: what a morphological closing fills, by a square that reaches so many spacings.
 _SMALL = 2
-#: A value marks holes if it is farther from all heights than this, and than their range times `_MOST_RANGES`.
+#: A value marks holes if it is farther from all heights than this [m], and than their range times `_MOST_RANGES`.
 _LEAST_GAP, _MOST_RANGES = 100.0, 10.0
 
 
-def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: str) -> list[str]:
+def check_no_undeclared_holes(
+    values: NDArray[np.float64], file: Path, remedy: str, metres_per_unit: float = 1.0
+) -> list[str]:
     """Raises TwinError if the least or greatest value can only mark holes; `remedy` says how to declare "{}".
 
     Returns a sentence for each of them that may mark holes: in several cells, and far from the others for their range.
@@ -29,7 +31,7 @@ def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: s
         low, high, n_cells = heights.min(), heights.max(), np.count_nonzero(finite == value)
         gap, problem = max(low - value, value - high), f"has the value {value:g} in {n_cells} cells, far from"
         problem += f" all others ({low:g} to {high:g}), and does not declare it as nodata"
-        if gap > max(_LEAST_GAP, _MOST_RANGES * (high - low)):
+        if gap > max(_LEAST_GAP / metres_per_unit, _MOST_RANGES * (high - low)):
             raise height_error(file, problem, remedy.format(f"{value:g}"))
         if n_cells > 1 and gap > high - low:
             doubts.append(f"{file.name!r} {problem}.")

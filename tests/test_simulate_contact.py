@@ -45,6 +45,19 @@ def test_a_level_hull_touches_a_level_floor_where_its_lower_side_reaches_it():
     assert touches_floor(floor, at(0, 0, -5.0)) and not touches_floor(floor, at(9.0, 0, -5.0))
 
 
+@pytest.mark.parametrize("slope", [-0.36, 0.36])
+def test_a_hull_above_a_steep_plane_of_coarse_cells_touches_nothing(slope):
+    """The highest corner of a cell lies above the hull, the floor below the hull does not."""
+    east_m = 10.0 * np.arange(7)
+    plane = np.tile((slope * east_m).astype(np.float32), (7, 1))
+    for heights, (dx, dy) in ((plane, (1, 0)), (plane.T, (0, 1))):
+        floor = floor_field(heights, 10.0, 0.0, 0.0, BOX)
+        for x in np.arange(21.0, 30.0):
+            centre = slope * x + 2.2
+            assert not touches_floor(floor, at(25 + (x - 25) * dx, 25 + (x - 25) * dy, centre))
+            assert touches_floor(floor, at(25 + (x - 25) * dx, 25 + (x - 25) * dy, slope * x - 0.5))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_contact_with_relief_agrees_with_points_sampled_on_the_hull(seed):
     """No point of the hull is below the floor where there is no contact; 5 mm farther down, one is."""

@@ -109,6 +109,8 @@ def test_readings_fail_by_their_kind():
     ('{part="thruster",number=1,type="garbage",start_s=1}', "faults.0.type: garbage: not simulated for thruster"),
     ('{part="cameras",start_s=1}', "faults.0.part: cameras: the surrogate has no images"),
     ('{part="pump",start_s=1}', "faults.0.part"),
+    ('{part="water",type="silt",start_s=1,size=-0.5}', "faults.0.size: -0.5: not a share of the contrast"),
+    ('{part="fish",type="school",start_s=1,size=-3}', "faults.0.size: -3: not a number of fish"),
 ])  # fmt: skip
 def test_a_fault_that_cannot_be_is_refused_before_the_flight(fault, problem):
     with pytest.raises(ScenarioError) as raised:
@@ -177,6 +179,16 @@ def test_silt_takes_contrast_at_equal_brightness_and_settles():
     assert spread[1.9] == spread[30.0] == 1
     assert spread[2.5] == pytest.approx(0.6, abs=0.01) and spread[5.0] == pytest.approx(0.2, abs=0.01)
     assert spread[9.0] == pytest.approx(1 - 0.8 * np.exp(-1), abs=0.01)
+
+
+def test_a_cloud_that_has_ended_does_not_rise():
+    image = np.random.default_rng(1).integers(20, 200, (40, 60, 3), np.uint8)
+    given = faults_of({"part": "water", "type": "silt", "start_s": 2.0, "duration_s": 0.2, "size": 1.0})
+    spread = []
+    for time_s in (2.2, 2.5, 3.0, 4.0):
+        given.at(time_s, HERE)
+        spread.append(given.images(image, None)[0].std() / image.std())
+    assert spread[0] == pytest.approx(0.8, abs=0.02) and spread == sorted(spread)
 
 
 def test_fish_move_and_have_the_parallax_of_their_distance():

@@ -6,6 +6,7 @@ import pytest
 
 from twin import survey
 from twin.core import geometry
+from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.scenario.model import TetherConfig, VehicleConfig
@@ -16,6 +17,7 @@ from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import steady_current
 from twin.simulate.tether import add_tether, steady_pulls, tether_of
 from twin.world.mission import prepare
+from twin.world.rendered_world import RenderedWorld
 
 LENGTH_M, AT = 30.0, np.array([0.5, -0.3, 2.0])
 CONFIG = TetherConfig(length_m=LENGTH_M)
@@ -106,6 +108,17 @@ def test_a_current_that_the_vehicle_holds_without_a_tether_may_be_too_strong_wit
     prepare(load_scenario("reef", [f"current.velocity_mps=[{-0.8 * limit},0.0,0.0]", "plan.speed_mps=0.02", place]))
     with pytest.raises(ScenarioError, match="0.35: too fast for the thrusters with its tether"):
         prepare(load_scenario("reef", ["tether.length_m=900.0"]))
+
+
+def test_a_tether_is_slack_where_it_is_caught():
+    caught = 'faults=[{part="tether",type="stuck",start_s=0.0,size=0.1}]'
+    still = ["current.velocity_mps=[0,0,0]", "tether.length_m=20.0", caught]
+    with RenderedWorld(prepare(load_scenario("reef", [*SHORT, *still])), Stopwatch()) as world:
+        attached = geometry.transform(world.vehicle.world_from_body, world.vehicle.tether.attachment_m)
+        world.faults.at(0.0, np.zeros(3))
+        world.act(np.zeros(len(world.vehicle.thrusters.factors)))
+        snag = world.vehicle.tether.snag.copy()
+    assert snag[0] == 1.0 and np.linalg.norm(snag[1:4] - attached) < 1e-9
 
 
 def test_a_caught_tether_is_no_complete_survey(tmp_path):

@@ -302,3 +302,11 @@ def test_too_large_a_texture_is_rejected_from_the_header(tmp_path):
     with pytest.raises(TwinError, match="'t.png' has 30000 x 30000 pixels") as caught:
         terrains.load(tmp_path / "dem.npy", terrains.TextureSource(0.1, texture), 0.5, 3.0, 0)
     assert caught.value.field == "terrain.texture_file"
+
+
+def test_heights_in_millimetres_are_as_far_apart_as_in_metres(tmp_path):
+    """A plate of 150 mm on a level floor: no value of holes."""
+    values = np.full((20, 20), -3000, np.int16)
+    values[4:7, 4:7] = -2850
+    heights = load(write(tmp_path / "mm.tif", values, unit="mm"), "up").height_m
+    assert np.ptp(heights) == pytest.approx(0.15, abs=1e-6)

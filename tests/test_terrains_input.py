@@ -95,6 +95,15 @@ def test_a_defective_pixel_does_not_darken_an_orthophoto_of_12_bits(tmp_path):
     )
 
 
+def test_pixels_without_data_do_not_darken_an_orthophoto_of_12_bits(tmp_path):
+    photo = np.random.default_rng(1).integers(500, 4000, (60, 80, 3)).astype(np.uint16)
+    photo[:10] = 65535
+    dem, colours = write(tmp_path / "dem.tif"), write(tmp_path / "photo.tif", photo, nodata=65535)
+    floor = terrains.load(dem, terrains.TextureSource(0.1, orthophoto_file=str(colours)), 0.1, 3.0, 0)
+    halves = np.split(floor.texture[: len(floor.texture) // 2 * 2], 2)  # one of them is far from those pixels
+    assert max(half.mean() for half in halves) == pytest.approx(photo[30:].mean() * 255 / 4095, rel=0.03)
+
+
 DOUBT = "'dem.tif' has the value 0 in 4 cells, far from all others (-6.1 to -5.9), and does not declare it as nodata."
 
 

@@ -20,7 +20,7 @@ from twin.terrains.objects.coloured_mesh import Mesh, with_colours
 from twin.terrains.objects.detail import levels_of
 from twin.terrains.objects.floor_mesh import tiles_of
 from twin.terrains.objects.mesh_file import face_count
-from twin.terrains.objects.placed_object import model_of
+from twin.terrains.objects.placed_object import PlacedObject, grown, model_of
 from twin.terrains.objects.shapes import SHAPES, build_shape
 from twin.world import objects
 from twin.world.objects import load_objects
@@ -88,6 +88,41 @@ def test_a_texture_becomes_the_colours_of_the_vertices(tmp_path):
     mesh = read(tmp_path / "square.glb")
     assert mesh_file.TEXTURED_FACES / 4 < len(mesh.faces) <= mesh_file.TEXTURED_FACES
     assert np.abs(mesh.colours[:, :2] - (mesh.vertices_m[:, :2] + 1) / 2 * 255).max() < 2
+
+
+def test_corners_of_no_triangle_do_not_count(tmp_path):
+    """As a cropped scan keeps them."""
+    stray = trimesh.Trimesh([*CUBE.vertices, [30.0, 0.0, -10.0]], CUBE.faces, process=False)
+    stray.visual.vertex_colors = np.tile([10, 20, 30, 255], (9, 1))
+    stray.export(tmp_path / "stray.ply")
+    mesh = read(tmp_path / "stray.ply")
+    np.testing.assert_allclose(np.ptp(mesh.vertices_m, axis=0), [2.0, 1.0, 0.5], atol=1e-6)
+    assert len(mesh.colours) == 8
+    floor = mesh_file.read_textured_mesh(tmp_path / "stray.ply", FIELD)
+    assert len(floor.uv) == len(floor.mesh.vertices_m) == 8
+
+
+def test_the_edges_of_a_texture_have_the_colours_of_their_own_side():
+    image = np.zeros((10, 20, 3), np.uint8)
+    image[:5, :10], image[5:, 10:] = [255, 0, 0], [0, 0, 255]  # v points up
+    uv = np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 1.0], [2.25, -0.75], [-0.25, 0.25]])
+    found = mesh_file._sampled(image, uv)
+    np.testing.assert_array_equal(found, [[255, 0, 0], [0, 0, 255], [0, 0, 0], [0, 0, 0], [0, 0, 255]])
+
+
+def test_the_colour_of_an_obj_material_is_its_colour_without_a_texture(tmp_path):
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 0.9 0.1 0.1\n")
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in CUBE.vertices)
+    faces = "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in CUBE.faces)
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl red\n{faces}")
+    for mesh in (read(tmp_path / "a.obj"), mesh_file.read_textured_mesh(tmp_path / "a.obj", FIELD).mesh):
+        np.testing.assert_allclose(mesh.colours, np.tile([230, 25, 25], (len(mesh.colours), 1)), atol=1)
+
+
+def test_a_flat_object_does_not_grow(tmp_path):
+    flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    with pytest.raises(TwinError, match="growth_m: 0.1: an object is 0 m high"):
+        grown(PlacedObject(model_of(with_colours(flat.vertices, flat.faces, 100)), np.eye(4), 1.0, 0), 0.1, "growth_m")
 
 
 def material_box(factor, texture=None):

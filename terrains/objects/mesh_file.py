@@ -84,10 +84,11 @@ def _parts_of(file: Path, field: str) -> Iterator[list[Any]]:
     with reading(file, field, FORMATS, MAX_BYTES):
         if (n_faces := face_count(file)) > MAX_FACES:
             raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
-        parts = _near_origin(_loaded(file, field))
+        parts = _loaded(file, field)
         for part in parts:
             part.update_faces(part.unique_faces())
-        yield parts
+            part.remove_unreferenced_vertices()  # they would count in extent and position
+        yield _near_origin(parts)
 
 
 def _loaded(file: Path, field: str) -> list[Any]:
@@ -154,8 +155,10 @@ def _own_colours(part: Any) -> Any:
     # The factor of a textured material is not used: trimesh writes one of 0.4 that is not intended.
     if hasattr(part.visual, "vertex_colors") and part.visual.defined:
         return np.asarray(part.visual.vertex_colors)[:, :3]
-    factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)
-    return None if factor is None else np.asarray(factor)[:3].astype(int)
+    material = getattr(part.visual, "material", None)
+    factor = getattr(material, "baseColorFactor", getattr(material, "diffuse", None))  # of GLB, of OBJ
+    is_given = factor is not None and tuple(factor[:3]) != _UNSTATED
+    return np.asarray(factor)[:3].astype(int) if is_given else None
 
 
 def _texture_of(part: Any) -> tuple[Any, Any] | None:
@@ -180,8 +183,9 @@ def _rgb(image: Any) -> NDArray[np.uint8]:
 def _sampled(image: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
     """Returns the colours (n, 3) of an image (h, w, 3) at texture coordinates (n, 2), repeated beyond 0 to 1."""
     height, width = image.shape[:2]
-    col = np.floor((uv[:, 0] % 1.0) * width).astype(np.int64) % width
-    row = np.floor(((1 - uv[:, 1]) % 1.0) * height).astype(np.int64) % height
+    u, v = (np.where((part < 0) | (part > 1), part % 1.0, part) for part in uv.T)
+    col = np.minimum((u * width).astype(np.int64), width - 1)
+    row = np.minimum(((1 - v) * height).astype(np.int64), height - 1)
     return image[row, col]
 
 
@@ -219,6 +223,7 @@ def crowded_edges(mesh: Mesh) -> int:
 
 
 FORMATS = "a PLY, OBJ or GLB file with triangles"
+_UNSTATED = (102, 102, 102)  # colour that trimesh gives to an OBJ file without one
 _LONGEST_HEADER = 65_536  # largest number of bytes of a PLY header, and of a part of an OBJ line read at once
 _MOST_ELEMENTS = 20_000_000  # largest number of elements of an accessor of a GLB file
 _LONGEST_JSON = 16_777_216  # largest number of bytes of the description in a GLB file

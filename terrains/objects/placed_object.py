@@ -50,7 +50,7 @@ class PlacedObject(NamedTuple):
 def grown(item: PlacedObject, growth_m: float, field: str) -> PlacedObject:
     """Returns an object whose height has increased by `growth_m` about its base; `field` is that of the TwinError."""
     height_m = item.scale * float(item.model.high_m[2])
-    if growth_m <= -height_m:
+    if growth_m <= -height_m or not height_m:
         raise TwinError(field, f"{growth_m:g}: an object is {height_m:.3g} m high", f"more than {-height_m:.3g}")
     factor = 1 + growth_m / height_m
     pose = item.world_from_object.copy()

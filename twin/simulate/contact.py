@@ -80,8 +80,12 @@ def touches_floor(floor, pose):
         for c in range(max(west, 0), min(east + 1, nx - 1)):
             if max(z[r, c], z[r, c + 1], z[r + 1, c], z[r + 1, c + 1]) < low:
                 continue
-            if r == int(y / floor.spacing_m) and c == int(x / floor.spacing_m) and z[r, c] > centre[2]:
-                return True
+            u, v = x / floor.spacing_m - c, y / floor.spacing_m - r
+            if 0 <= u < 1 and 0 <= v < 1:  # the floor below the centre, on one of the two triangles of the cell
+                i, j = (0, 1) if u >= v else (1, 0)
+                middle = z[r + i, c + j]
+                if z[r, c] + max(u, v) * (middle - z[r, c]) + min(u, v) * (z[r + 1, c + 1] - middle) > centre[2]:
+                    return True
             for n, (i, j) in enumerate(((0, 0), (0, 1), (1, 1), (1, 0))):  # into the axes of the box
                 p, q = (c + j) * floor.spacing_m - x, (r + i) * floor.spacing_m - y
                 for k in range(3):

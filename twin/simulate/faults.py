@@ -92,7 +92,7 @@ class Faults:
         return command, factors
 
     def catch_tether(self, tether: Tether, position_m: Array) -> None:
-        """Catches the tether at the position (3,) of the vehicle, or lets it go."""
+        """Catches the tether at the position (3,) of its attachment, or lets it go."""
         caught = self._of("tether")
         if not caught:
             tether.snag[:] = 0.0
@@ -136,7 +136,8 @@ class Faults:
             since_s = self._time_s - start_s
             if fault.type == "silt" and since_s >= 0:
                 settled = float(np.exp(-max(0.0, self._time_s - end_s) / _SETTLE_S))
-                share = min(fault.size, 1.0) * min(1.0, since_s / _RISE_S) * settled  # of the contrast
+                risen = min(1.0, min(since_s, end_s - start_s) / _RISE_S)
+                share = min(fault.size, 1.0) * risen * settled  # of the contrast
                 if share > _LEAST_SILT:
                     seen = [image if image is None else behind_silt(image, share, self._rng) for image in seen]
             elif fault.part == "fish" and 0 <= since_s < end_s - start_s:

@@ -12,7 +12,7 @@ from twin.simulate.parameters import moves_along_all_axes
 
 _IN_IMAGES = ("cameras", "left_camera", "right_camera", "lamp", "fish")  # parts whose faults change images, as silt
 _MESH_KEYS = ("mesh_file", "mesh_up", "mesh_scale")
-_FILE_KEYS = ("height_file", "texture_file", "orthophoto_file", "z")
+_FILE_KEYS = ("height_file", "texture_file", "orthophoto_file", "z", "height_spacing_m", "height_range_m")
 
 
 def contradictions(scenario: Scenario) -> Iterator[TwinError]:
@@ -204,8 +204,9 @@ def _of_faults(scenario: Scenario) -> Iterator[TwinError]:
             yield TwinError(f"{key}.{(when or ['start_s'])[0]}", problem, "either start_s, at_m or per_hour")
         if fault.at_m is None:
             yield from keys_without_effect(key, fault, ["radius_m"], "has no effect without a place", "with at_m")
-        if fault.type == "delayed" and fault.size <= 0:
-            yield TwinError(f"{key}.size", f"{fault.size:g}: not a delay", "above 0")
+        what = {"delayed": "a delay", "silt": "a share of the contrast", "school": "a number of fish"}.get(fault.type)
+        if what is not None and fault.size <= 0:
+            yield TwinError(f"{key}.size", f"{fault.size:g}: not {what}", "above 0")
         if fault.type == "intermittent" and not 0 <= fault.size <= 1:
             yield TwinError(f"{key}.size", f"{fault.size:g}: not a share of the frames", "0 to 1")
         if scenario.imaging.fidelity == "surrogate" and (fault.part in _IN_IMAGES or fault.type == "silt"):

@@ -163,7 +163,8 @@ class World(ABC):
             n = len(thrusters.factors)  # commands of fins follow those of the thrusters
             arriving, factors = self.faults.thrusts(command)
             thrusters.factors[:] = factors[:n]
-            self.faults.catch_tether(self.vehicle.tether, pose[:3, 3])
+            tether = self.vehicle.tether
+            self.faults.catch_tether(tether, geometry.transform(pose, tether.attachment_m))
             self.faults.blow(self.vehicle.sea.single_gusts, pose[:3, 1])
             self.vehicle.step(arriving, interval_s)
             if scenario.control.thruster_feedback == "speed":
