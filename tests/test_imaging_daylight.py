@@ -342,3 +342,11 @@ def test_the_light_on_the_floor_is_that_of_the_light_field_at_all_depths():
             field = LightField(BandWater(a, b, water.scatterers[band]), source, 1)
             expected = sum(field.illuminance(5.0 + depth_m, 5.0 + depth_m))
             assert optics.floor_lx(level(depth_m)[1], 0)[CENTRE][band] == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(("jerlov", "turbidity", "depth_m"), [("9C", 100.0, 300.0), ("9C", 20.0, 500.0)])
+def test_deep_dark_water_has_no_daylight_and_no_error(jerlov, turbidity, depth_m):
+    sun = SunConfig(illuminance_lx=5e4, elevation_deg=40.0, depth_m=depth_m)
+    optics = optics_under(sun, WaterConfig(jerlov=jerlov, turbidity=turbidity))
+    light = optics.radiance(*level(2.0), 0, SceneView(surface=WaterSurface(None, looking_down(0.0))))
+    assert np.isfinite(light).all() and light.max() < 1e-6

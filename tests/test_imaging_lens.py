@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 
 from twin.core.resample import EXACT, interpolate
 from twin.core.timing import Stopwatch
-from twin.errors import ScenarioError
+from twin.errors import ScenarioError, TwinError
 from twin.imaging.camera.lens import Distortion, distort, fold, undistort
 from twin.imaging.camera.ray_sampling import sample_rays
 from twin.imaging.camera.true_cameras import make_true_cameras
@@ -199,3 +199,9 @@ def test_an_invalid_lens_is_rejected_with_file_and_line(tmp_path, line, message)
     with pytest.raises(ScenarioError) as error:
         prepare(load_scenario(file))
     assert error.value.lines == [f"{file}:3: {message}"]
+
+
+def test_a_lens_that_spreads_the_frame_over_a_huge_sensor_is_refused():
+    wide = {"image_width_px": 320, "image_height_px": 240, "hfov_deg": 120.0}
+    with pytest.raises(TwinError, match="lens.k1: the sensor needs a border of 172.. px .*less distortion"):
+        make_true_cameras(scenario(rig=wide, lens={"k2": 5.0}))

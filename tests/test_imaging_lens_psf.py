@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from twin.errors import TwinError
 from twin.imaging.camera.lens_psf import LensPsf, defocus_of, diffraction_mtf, mtf
 from twin.scenario.model import Scenario
 
@@ -107,3 +108,14 @@ def test_lateral_colour_magnifies_red_and_blue_about_the_centre():
             centre = np.array([(near * U).sum(), (near * V).sum()]) / near.sum()
             middle = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
             np.testing.assert_allclose(centre - middle, scale * (np.array([u, v]) - middle), atol=0.02)
+
+
+def test_a_disc_of_diffraction_wider_than_the_kernel_is_refused():
+    """Its radius is 1.22 wavelengths times the f-number: 4 px of 3.45 um at f / 18.9 in red."""
+    for f_number, fits in ((18.8, True), (19.0, False)):
+        sensor = {"pixel_um": 3.45, "f_number": f_number}
+        if fits:
+            psf(scenario(sensor, diffraction=True))
+        else:
+            with pytest.raises(TwinError, match="lens.diffraction: its disc has a radius of 4.0 px .*up to 18.9"):
+                psf(scenario(sensor, diffraction=True))

@@ -223,3 +223,25 @@ def test_metering_equals_numpys_mean_to_the_last_bit():
     light = np.random.default_rng(0).gamma(2, 20, (63, 85, 3)).astype(np.float32)
     want = light.mean(axis=0, dtype=np.float64).mean(axis=0)
     np.testing.assert_array_equal(_mean(light.reshape(63, -1)), want)
+
+
+@pytest.mark.parametrize("sensor", [None, PHYSICAL])
+def test_images_of_the_right_camera_between_keyframes_have_a_noise_of_their_own(sensor):
+    """The same view: images with independent noise are equal at a tenth of the pixels."""
+    camera = camera_of(small(sensor))
+    right, other = camera.capture(DOWN, True).right, camera.capture(DOWN, True).right
+    again = camera_of(small(sensor))
+    again.capture(DOWN, True)
+    again.capture(DOWN, False)
+    apart = again.right_apart(DOWN)
+    for first in (right, other):
+        assert np.mean(apart == first) < 0.4
+
+
+def test_a_pair_apart_does_not_change_the_exposure_of_the_right_camera():
+    camera = camera_of(small(PHYSICAL))
+    for k in range(3):
+        camera.capture(DOWN + np.array([[0, 0, 0, 0.05 * k]] + [[0] * 4] * 3), True)
+    before = camera._last_setting
+    camera.capture_apart(DOWN)
+    assert camera._last_setting is before

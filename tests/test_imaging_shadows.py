@@ -181,10 +181,10 @@ def test_a_shadow_removes_the_light_of_its_lamp_only() -> None:
     np.testing.assert_allclose(port[~dark], free[~dark], rtol=1e-5)
 
 
-def halos(floor: Any, lamp_m: tuple[float, float, float]) -> LampHalos:
+def halos(floor: Any, lamp_m: tuple[float, float, float], **properties: Any) -> LampHalos:
     """Returns the halo of an even lamp [m, world axes] for a camera 2 m above the origin, in water of type II."""
     even = {"position_m": (0.0, 0.0, 0.0), "beam": [(0.0, 1.0), (90.0, 1.0)]}
-    water = medium(WaterConfig(jerlov="II"))
+    water = medium(WaterConfig.model_validate(properties or {"jerlov": "II"}))
     daylight = daylight_at(SunConfig(illuminance_lx=0.0), water, 0.0)
     sources = light_sources_in_camera(RIG, (LampConfig.model_validate(even),), daylight, 0)
     position = geometry.transform(geometry.inverse(DOWN), np.array([lamp_m]))
@@ -206,6 +206,17 @@ def test_a_high_wall_beside_a_point_hides_half_of_the_halo_of_a_lamp_above_it() 
         node = int(np.argmin(np.abs(np.array(NODES_M) - 2.0)))
         share = hidden_share(halo._solid, (x, 0.0, 0.0), lamp, halo._halo, False)
         assert share / dark[node] == pytest.approx(expected * (1 - core[node]), abs=0.06)
+
+
+def test_light_is_hidden_also_in_water_that_scatters_no_green() -> None:
+    lamp_m, absorption = (0.5, 0.0, 2.0), (0.1, 0.1, 0.1)
+    found = [
+        halos(wall(0.5), lamp_m, absorption_per_m=absorption, scattering_per_m=(0.3, green, 0.3))._halo
+        for green in (0.0, 0.3)
+    ]
+    for without, with_green in zip(*(halo[:2] for halo in found if halo is not None), strict=True):
+        np.testing.assert_allclose(without, with_green, rtol=0.05)
+        assert np.isfinite(without).all()  # to the effect of the wavelength on molecules
 
 
 def test_scattered_light_is_hidden_around_shadows_only() -> None:

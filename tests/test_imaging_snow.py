@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import brentq
 
 from twin.core import geometry
+from twin.errors import TwinError
 from twin.imaging.camera.lens_psf import Defocus
 from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
 from twin.imaging.camera.shutter import ExposureMotion
@@ -340,3 +341,10 @@ def test_snow_reaches_the_floor_of_a_high_flight():
     for low, high in ((1.5, 2.5), (3.0, 4.0)):
         expected = 20 * volume_m3(low, high)
         assert ((z > low) & (z < high)).sum() == pytest.approx(expected, abs=5 * np.sqrt(expected))
+
+
+def test_more_particles_than_memory_holds_are_refused():
+    properties = medium(WaterConfig(jerlov="II"), "single")
+    sources = [LampLight(light_sources(camera), properties) for camera in (0, 1)]
+    with pytest.raises(TwinError, match="snow.density_per_m3: .* particles around .*allowed: up to .* at this altit"):
+        MarineSnow(SnowConfig(density_per_m3=5000), np.zeros(3), RIG, sources, np.random.default_rng(0), None, 40.0)

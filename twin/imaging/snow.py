@@ -17,6 +17,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.records import Array, Depth, Radiance, StereoRig
 from twin.core.threads import in_row_bands
+from twin.errors import TwinError
 from twin.imaging.camera.lens_psf import Defocus
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.light.lamp_light import LampLight
@@ -27,6 +28,7 @@ from twin.scenario.model import SnowConfig
 #: Least side of the periodic box. Along each world axis, snow is visible up to half a side from the left camera; half a
 #: side is at least MARGIN times the extent of the image of a level floor.
 BOX_M, MARGIN = 5.0, 1.1
+_MOST_PARTICLES = 2e7  # 1.3 GB of memory
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
 APERTURE_M = 0.004  # diameter of the lens aperture where the scenario has no depth of field
 PIXEL_BLUR_PX = 1.0  # blur of the image of a particle by the lens
@@ -61,6 +63,9 @@ class MarineSnow:
         aside_m = height_m * np.hypot(rig.width_px, rig.height_px) / 2 / rig.focal_px
         self._box_m = np.maximum(BOX_M, 2 * MARGIN * np.array([aside_m, aside_m, height_m]))
         n = round(snow.density_per_m3 * float(np.prod(self._box_m)))
+        if n > _MOST_PARTICLES:
+            allowed = f"up to {_MOST_PARTICLES / float(np.prod(self._box_m)):.3g} at this altitude and field of view"
+            raise TwinError("snow.density_per_m3", f"{n:.2g} particles around the cameras", allowed)
         self._start_m = rng.uniform(0, self._box_m, (n, 3))
         self._diameter_m = diameters(snow, len(self._start_m), rng)
         self._snow, self._current_mps, self._rig, self._water = snow, current_mps, rig, lamp_light[0].water

@@ -65,7 +65,7 @@ class StereoCamera:
         self._camera_from_body_twist = [geometry.adjoint(geometry.inverse(pose)) for pose in body_from_cameras]
         self._sensor, self.psf = sensor_of(scenario, self._cameras.raw_rig), LensPsf(scenario, rig)
         self._focal_px, self._linear = rig.focal_px, scenario.delivers_linear_images
-        self._rngs, self._rng_apart = (left_rng, right_rng), copy.deepcopy(right_rng)
+        self._rngs, self._rng_apart = (left_rng, right_rng), right_rng.spawn(1)[0]
         self._n_captures, self._last_setting = 0, self._sensor.setting
 
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
@@ -107,13 +107,13 @@ class StereoCamera:
 
     def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
         """Returns both images (H, W, 3) at the time of the last capture, with the noise of the next."""
-        kept = self._sensor, self._rngs, self._n_captures
+        kept = self._sensor, self._rngs, self._n_captures, self._last_setting
         self._sensor, self._rngs = copy.deepcopy(kept[:2])
         self._n_captures = max(self._n_captures - 1, 0)
         try:
             captured = self.capture(world_from_left, True, twist_body)
         finally:
-            self._sensor, self._rngs, self._n_captures = kept
+            self._sensor, self._rngs, self._n_captures, self._last_setting = kept
         assert captured.right is not None
         return captured.left, captured.right
 

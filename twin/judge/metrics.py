@@ -159,14 +159,11 @@ def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
     n_frames = min(len(result.online), len(result.final), len(truth.trajectory), len(truth.reference))
     n = int(np.searchsorted(result.keyframe_rows, n_frames))
     return replace(
-        result,
-        keyframe_rows=result.keyframe_rows[:n],
-        track_of_keyframe=result.track_of_keyframe[:n],
-        node_cov=result.node_cov[:n],
-        keyframe_depth_m=result.keyframe_depth_m[:n],
+        result, keyframe_rows=result.keyframe_rows[:n], track_of_keyframe=result.track_of_keyframe[:n],
+        node_cov=result.node_cov[:n], keyframe_depth_m=result.keyframe_depth_m[:n],
         links=result.links.select(result.links.j < n),
         stereo_observations=[pair for pair in result.stereo_observations if pair.row < n_frames],
-    )
+    )  # fmt: skip
 
 
 def check_require(names: Mapping[str, float]) -> None:

@@ -138,11 +138,8 @@ def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None 
     low, high = scale or height_scale(heights)
     filled = np.clip(np.where(empty, (low + high) / 2, heights), low, high)
     shaded = LightSource(315, 45).shade(
-        filled,
-        matplotlib.colormaps[cmap],
-        Normalize(low, high),
-        "soft",
+        filled, matplotlib.colormaps[cmap], Normalize(low, high), "soft",
         vert_exag=0.12 * max(heights.shape) / ((high - low) or 1.0),
-    )
+    )  # fmt: skip
     shaded[..., 3] = ~empty
     return shaded

@@ -76,8 +76,7 @@ def _paper_table(survey: TankSurvey) -> Table:
     bend_m = float(bend[np.abs(x - 0.2) < 0.05].mean() - bend[np.abs(x - 0.2) > 0.3].mean())
     n_pairs = "61" if survey.path.repeats else "130"
     rows = [
-        ("", "paper", "ours"),
-        ("stereo pairs", n_pairs, str(len(x))),
+        ("", "paper", "ours"), ("stereo pairs", n_pairs, str(len(x))),
         ("distance to the floor", "about 1.5 m (5 ft)", f"{height_m:.2f} m"),
         ("pixel on the floor", "about 5 mm (0.2 in)", millimetres(height_m / rig.focal_px)),
         ("mapped area", "about 2 m2 (1 m x 2 m)", f"{seen_m2:.1f} m2"),
@@ -85,7 +84,7 @@ def _paper_table(survey: TankSurvey) -> Table:
         ("position error before alignment, largest", DASH, millimetres(float(errors["f2f"].distance_m.max()))),
         ("position error after alignment, largest", DASH, millimetres(float(errors["final"].distance_m.max()))),
         ("bend of the track, by the path after alignment", "seen, not measured", f"{millimetres(bend_m)} of 12 mm"),
-    ]
+    ]  # fmt: skip
     return make_table("rows", "The paper's figures", rows)
 
 

@@ -286,12 +286,9 @@ class StudyAnalysis:
         results = [self.pass_record.results(worst).astype(float) for worst in (True, False)]
         first, second = (curves[key] for key in ranked)
         return passing_map(
-            (ranked[0], ranked[1]),
-            np.array([self.regressions[key].x for key in ranked]),
-            (first.rises, second.rises),
-            (results[0], results[1]),
-            max(first.design_effect, second.design_effect),
-        )
+            (ranked[0], ranked[1]), np.array([self.regressions[key].x for key in ranked]), (first.rises, second.rises),
+            (results[0], results[1]), max(first.design_effect, second.design_effect),
+        )  # fmt: skip
 
     @cached_property
     def refused_samples(self) -> list[RefusedSample]:

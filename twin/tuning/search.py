@@ -68,12 +68,9 @@ class Search:
             return
         for values, objectives, shortfall in islice(candidates, len(known), None):
             trial = create_trial(
-                params=values,
-                distributions=self.space,
-                values=list(objectives),
-                constraints={"shortfall": shortfall},
+                params=values, distributions=self.space, values=list(objectives), constraints={"shortfall": shortfall},
                 user_attrs={_EARLIER: True},
-            )
+            )  # fmt: skip
             self.optuna_study.add_trial(trial)
 
     def next_batch(self) -> dict[int, Trial]:

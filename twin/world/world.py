@@ -229,13 +229,10 @@ class World(ABC):
         cells, surface = np.meshgrid(*detail.grid.centres()), self.surface_on(detail.grid)
         unknown, poses = self.mission.terrain.in_hole(*cells), self._true_poses.array[rows]
         return replace(
-            truth,
-            height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
+            truth, height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
             seen=seen_over(detail.grid, self.mission.rig, field_of(self.true_floor()), poses) & ~unknown,
-            asked=detail.area.contains(*cells) & ~unknown,
-            objects=surface.objects,
-            overhung=surface.overhung,
-        )
+            asked=detail.area.contains(*cells) & ~unknown, objects=surface.objects, overhung=surface.overhung,
+        )  # fmt: skip
 
 
 def left_camera(vehicle: "AnyVehicle", rig: StereoRig) -> Array:

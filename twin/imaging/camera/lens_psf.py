@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, Depth, Radiance, StereoRig
 from twin.core.threads import QUICK, in_row_bands
+from twin.errors import TwinError
 from twin.imaging.camera.port import pinhole
 from twin.imaging.light.spectra import CENTRE_NM
 from twin.kernels import kernel
 from twin.scenario.model import LensConfig, Scenario, SensorConfig
 
+_AIRY_UM = 1.22 * CENTRE_NM[0] * 1e-3  # radius of the Airy disc of red light at f/1
 REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels along each side; `_add_across` is written for 4
 TAPS = 4  # taps of cubic interpolation
 GRID = 64  # samples of the MTF along each axis, from which the kernel is computed
@@ -123,6 +125,9 @@ def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.flo
 
 def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
     """Returns the kernel (2 REACH_PX + 1, 2 REACH_PX + 1) of a band, the inverse Fourier transform of its MTF."""
+    if lens.diffraction and sensor is not None and (airy := _AIRY_UM * sensor.f_number / sensor.pixel_um) > REACH_PX:
+        allowed = f"sensor.f_number up to {REACH_PX * sensor.pixel_um / _AIRY_UM:.3g}"
+        raise TwinError("lens.diffraction", f"its disc has a radius of {airy:.1f} px", allowed)
     nu = np.fft.fftfreq(GRID)
     share = mtf(lens, sensor, band, np.hypot(nu, nu[:, None]))
     kernel = np.fft.fftshift(np.fft.ifft2(share).real)

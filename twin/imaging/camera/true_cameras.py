@@ -26,6 +26,7 @@ from twin.scenario.model import CalibrationErrorConfig, PortConfig, Scenario
 
 NEAREST_M = 0.3  # smallest depth of the floor for which the rendered margin suffices
 MARGIN_STEP_PX = 8  # margins are multiples of this; two of them add a multiple of 16 to the width or height
+_MOST_BORDER = 2  # largest border of the sensor around the frame that the rectification needs [frames]
 WIDEST_TANGENT = 5.0  # largest tangent of half the field of view
 
 
@@ -136,6 +137,8 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     if calibrated or any(believed.lens):
         rectification = _rectification(believed, _size_px(believed_rig), believed_rig.focal_px, depth_m)
         border = _missing_px(rectification, believed_rig)
+        if (border > _MOST_BORDER * np.array(_size_px(believed_rig))).any():
+            raise TwinError("lens.k1", f"the sensor needs a border of {border.max()} px", "less distortion")
         rectification = rectification + border
     columns, rows = border.tolist()
     rays = [_rendered_rays(model, (columns, rows), believed_rig) for model in models]

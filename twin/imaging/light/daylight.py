@@ -161,6 +161,8 @@ def _veil_terms(depth_m: float, water: Medium, source: SunSky, range_m: Array) -
 
 def _local_attenuation(field: LightField, depth_m: float) -> float:
     above, below = (sum(field.illuminance(z, np.inf)) for z in (max(depth_m - 0.25, 0.0), depth_m + 0.25))
+    if not min(above, below) > 0:
+        return 0.0  # no light is left
     return float(np.log(above / below) / (depth_m + 0.25 - max(depth_m - 0.25, 0.0)))
 
 

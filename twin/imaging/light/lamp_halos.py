@@ -57,7 +57,9 @@ class LampHalos:
         grid = height, *tops_of(height), floor.west_m, floor.south_m, floor.spacing_m
         near_m = 0.0 if tops_m is None else UNRESOLVED_CELLS * floor.spacing_m
         self._solid, self._sources = (grid, float(height.max()), near_m), sources
-        self._halo = _halo_of(water.bands[1]) if water.scatters_repeatedly else None
+        # that of green, unless another colour scatters alone
+        band = water.bands[1] if water.scattering_per_m[1] > 0 else water.bands[int(np.argmax(water.scattering_per_m))]
+        self._halo = _halo_of(band) if water.scatters_repeatedly else None
         cosine = 1 - np.linspace(0.0, 1.0, BEAM_STEPS + 1) ** 2
         self._beams = np.array([beam_share(cosine, beam) for beam in sources[0].beam])
 
@@ -80,7 +82,7 @@ def _halo_of(water: BandWater) -> tuple[Array, Array, Array]:
     # the lamp first, and its distance / that of the lamp.
     weights, turn = lamp_mixture(water, NODES_M, "particle"), np.linspace(CORE_RAD, MOST_TURNED, TURN_STEPS)
     square = (turn / LAMP_SIGMA_RAD[:, None]) ** 2
-    beyond = weights @ ((1 + square) * np.exp(-square / 2)) / weights.sum(1, keepdims=True)
+    beyond = weights @ ((1 + square) * np.exp(-square / 2)) / np.maximum(weights.sum(1, keepdims=True), 1e-300)
     beyond = np.minimum.accumulate(np.minimum(beyond, 1.0), axis=1)
     share, place, azimuth = ((0.5 + np.arange(PATHS)[:, None] * SEQUENCE) % 1.0).T
     turned = np.array([np.interp(-row[0] * (1 - share), -row, turn) for row in beyond])
