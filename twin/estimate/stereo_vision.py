@@ -106,8 +106,7 @@ class StereoVision(AbstractContextManager["StereoVision"]):
             interval_s = frame.time_s - last_s if frame.time_s > last_s else None
             frozen = self.repeats.status(frame, self.f2f.filter.velocity, interval_s or 1 / self.rig.frame_rate_hz)
             unusable, imu = frozen if frozen == LEFT_REPEATS else "", frame.readings.imu
-            imu = None if imu is None else imu.until(frame.time_s)
-            motion, status = self.f2f.step(self._image, interval_s, unusable, imu)
+            motion, status = self.f2f.step(self._image, interval_s, unusable, imu and imu.until(frame.time_s))
             if frozen == RIGHT_REPEATS and status != "ok":
                 frozen = RIGHT_REPEATS_BLIND
             return motion, status if frozen == "ok" else frozen

@@ -463,7 +463,8 @@ class ImagingConfig(Section):
     """the sea floor and objects cast shadows in the light of lamps and sun"""
     scattering: ScatteringModel = "full"
     """full: multiple scattering softens the beams, blurs the image and brightens the backscatter; single: light
-    scattered once is the backscatter, other scattered light is lost; none: the water only absorbs"""
+    scattered once is the backscatter, that of daylight as for a level camera at the planned height below a sun at the
+    zenith, other scattered light is lost; none: the water only absorbs"""
 
 
 class SensorConfig(Section):
