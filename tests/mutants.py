@@ -49,7 +49,7 @@ MUTANTS = [
         ("terrains/load.py", "values = given.values[::-1]", "values = given.values", "terrains_load"),
         ("terrains/objects/detail.py", "x, y, z = np.cross(ab, ac).T", "x, y, z = np.cross(ac, ab).T", "imaging_mesh_parts"),
         ("terrains/objects/scattering.py", "np.hypot(east, north) / (2 * reach_m)", "np.hypot(east, north) / reach_m", "world_placement terrains_objects"),
-        ("terrains/objects/mesh_file.py", "row = np.floor(((1 - uv[:, 1]) % 1.0) * height)", "row = np.floor((uv[:, 1] % 1.0) * height)", "terrains_objects"),
+        ("terrains/objects/mesh_file.py", "row = np.minimum(((1 - v) * height)", "row = np.minimum((v * height)", "terrains_objects"),
         # controllers
         ("controllers/lawnmower.py", "(1 - request.overlap_across) * request.footprint_m[0]", "(1 - request.overlap_across) * request.footprint_m[1]", "controllers_lawnmower"),
         ("controllers/loops.py", "loop_diameter_m * math.sin(math.pi / n_filling)", "loop_diameter_m * math.sin(2 * math.pi / n_filling)", "controllers_loops"),
