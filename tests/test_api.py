@@ -81,3 +81,10 @@ def test_a_survey_returns_its_arrays_and_a_second_one_gets_its_own_folder(tmp_pa
 def test_a_plan_is_summarised_and_drawn(tmp_path):
     plan = twin.plan("reef", tmp_path / "plan.png", plan=SMALL)
     assert plan.meets_requirements and (tmp_path / "plan.png").stat().st_size > 1000
+
+
+def test_a_missing_value_in_a_table_is_the_default_and_a_scenario_is_no_run():
+    scenario = twin.load_scenario("reef", lamps=[{"position_m": [0.2, 0.3, 0.0], "tilt_deg": None}])
+    assert len(scenario.lamps) == 1
+    with pytest.raises(TwinError, match="run: is a Scenario"):
+        twin.export(scenario, "csv")

@@ -1,5 +1,6 @@
 """Checkpoints: a killed run goes on as if undisturbed, and what is damaged or of another run is refused."""
 
+import ctypes
 import json
 import os
 import pickle
@@ -349,6 +350,17 @@ def test_a_checkpoint_that_failed_gives_its_space_to_the_results(tmp_path):
     checkpoints.save_if_due("state")
     checkpoints.save_last(lambda: None)  # cannot be saved
     assert checkpoints.problem and not (tmp_path / FOLDER).exists()
+
+
+def test_whatever_an_object_of_a_plug_in_raises_the_survey_goes_on(tmp_path):
+    deep = []
+    for _ in range(100_000):
+        deep = [deep]
+    for state in ({"pointer": ctypes.pointer(ctypes.c_int(3))}, deep):
+        checkpoints = Checkpoints(tmp_path, {}, (), 1e-9)
+        checkpoints.open(False)
+        checkpoints.save_if_due(state)
+        assert checkpoints.problem
 
 
 def test_a_start_that_is_refused_for_lack_of_space_leaves_no_files(tmp_path, monkeypatch):

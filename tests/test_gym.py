@@ -73,6 +73,20 @@ def test_an_episode_that_follows_the_plan_covers_the_area_and_ends_with_the_plan
     env.close()
 
 
+def test_an_area_without_a_cell_is_covered():
+    env = make("plan.area_m=[0.5, 0.5]", "map.cell_m=1.0")
+    assert env.reset(seed=1)[1]["truth"]["covered"] == 1.0
+    env.close()
+
+
+def test_the_controller_of_an_episode_sees_the_thruster_monitor():
+    lost = ['faults=[{part="thruster",number=2,start_s=0.0}]', "control.thruster_feedback=speed"]
+    env = make(*lost, action="velocity")
+    env.reset(seed=1)
+    assert env.unwrapped._steer._monitor is env.unwrapped.world.world.thruster_monitor
+    env.close()
+
+
 def test_a_velocity_moves_the_target_in_the_axes_of_the_vehicle():
     """Forward, left and up, at a heading of 90 deg after a quarter turn: forward is north, left is west."""
     env = make()

@@ -101,3 +101,12 @@ def test_a_world_before_its_reset_and_after_its_end_refuses_to_step():
     world.close()
     with pytest.raises(RuntimeError, match="call reset first"):
         world.truth()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**70, 2.5])
+def test_a_seed_out_of_range_is_refused_before_the_flight_ends(seed):
+    with twin.World(tiny("imaging.fidelity=surrogate", "imaging.extrapolate=true")) as world:
+        world.reset(3)
+        with pytest.raises(TwinError, match="seed: .*allowed: a whole number from 0 to 4294967295"):
+            world.reset(seed)
+        assert world.step(np.zeros(8)) is not None

@@ -14,6 +14,7 @@ from twin import scenes, survey
 from twin.app.look import render_view
 from twin.core import geometry
 from twin.core.height_field import cast_pixels, height_field
+from twin.core.records import NO_STEREO
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted
 from twin.estimate.vision import matching
@@ -21,6 +22,7 @@ from twin.imaging.camera.photo_sensor import sensor_of
 from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.scenario.file import load_scenario
 from twin.session.assembly import navigator_with, open_world
+from twin.session.stepped_world import SteppedWorld
 from twin.surrogate import error_model_file
 from twin.surrogate.matchability import (
     EVEN_TEXTURE,
@@ -624,3 +626,14 @@ print(*(name for name in ("mujoco", "OpenGL", "matplotlib", "rerun", "rasterio",
 """
     done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_a_view_of_one_row_of_floor_points_is_no_keyframe():
+    """Beyond the edge of a level floor, points in one line leave the rotation about it undetermined."""
+    sets = ["imaging.fidelity=surrogate", "imaging.extrapolate=true", "plan.area_m=[2.0,1.0]", "terrain.kind=flat"]
+    with SteppedWorld(load_scenario("quickstart", [*sets, "vehicle.dynamics=kinematic"])) as world:
+        frame, estimators, statuses = world.reset(), world.estimator(), []
+        while frame is not None:
+            statuses.append(estimators.update(frame, 1).status)
+            frame = world.step(np.array([0.0, 1.0, 0.0]), keyframe=len(statuses) % 5 == 0)
+    assert NO_STEREO in statuses[-10:]

@@ -197,7 +197,7 @@ def export(run: str | Path | RunResult, formats: str | Sequence[str], out: str |
     """Writes a run, or the planned path of a scenario, in the formats of other programs; returns the files by format.
 
     Args:
-        run: a run or its folder; for the formats of a planned path, also a scenario.
+        run: a run or its folder; for the formats of a planned path, also the name or file of a scenario.
         formats: names of formats, as `twin export --list` prints them.
         out: folder to write; default: the folder `export` in the run folder, for a planned path `runs`.
 
@@ -274,6 +274,8 @@ def _scenario(scene: str | Path | Scenario, overrides: Overrides, sections: Mapp
 
 
 def _folder(run: str | Path | RunResult) -> Path:
+    if not isinstance(run, str | Path) and not hasattr(run, "folder"):
+        raise TwinError("run", "is a Scenario", "a run, a folder, or the name or file of a scenario")
     return Path(run) if isinstance(run, str | Path) else run.folder
 
 
@@ -296,7 +298,7 @@ def _toml(value: Any) -> Any:
         return _toml(value.tolist())
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
-        table.update({str(key): _toml(inner) for key, inner in value.items()})
+        table.update({str(key): _toml(inner) for key, inner in value.items() if inner is not None})
         return table
     if isinstance(value, list | tuple):
         items = tomlkit.array()

@@ -55,7 +55,7 @@ class _SurveyEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _start(self) -> None:
         self._frame = self.world.reset(int(self.np_random.integers(2**31)))
-        self._steer, start = make_pilot(self.world.mission), self.world.reference
+        self._steer, start = make_pilot(self.world.mission, self.world.world.thruster_monitor), self.world.reference
         self._target = Reference(start.position.copy(), np.zeros(3), float(start.yaw), np.zeros(3))
 
     def _command(self, values: Array) -> Array:
@@ -216,7 +216,7 @@ class SeabedTwinEnv(_SurveyEnv):
         truth = {
             "world_from_camera": self.world.true_pose,
             "distance_to_plan_m": self.distance_m,
-            "covered": self._covered_m2 / asked_m2,
+            "covered": self._covered_m2 / asked_m2 if asked_m2 else 1.0,
         }
         return {"time_s": self._frame.time_s, "truth": truth, "ended": self._ended}
 

@@ -120,8 +120,7 @@ class Checkpoints:
             self._contents["state"] = {"number": number, "sha256": file_hash(file)}
             self._write_manifest()
             self.problem = ""
-        except (OSError, MemoryError, pickle.PicklingError, TypeError, AttributeError) as error:
-            # the last three: an object of a plug-in cannot be saved
+        except Exception as error:  # of the disk, or of an object of a plug-in that cannot be saved: any
             self._contents["state"], self.problem = old, str(error) or type(error).__name__
         kept = f"state-{(self._contents['state'] or {}).get('number')}.pickle"
         for other in self._folder.glob("*"):

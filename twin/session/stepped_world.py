@@ -13,6 +13,7 @@ from twin.core.geometry import Array
 from twin.core.records import Estimate, Frame, Image, StereoRig, Truth
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
+from twin.errors import TwinError
 from twin.scenario.model import Scenario
 from twin.session.assembly import Estimators, make_navigator, open_world
 from twin.session.mission_actions import MissionActions
@@ -66,6 +67,8 @@ class SteppedWorld(AbstractContextManager["SteppedWorld"]):
             ScenarioError: the survey cannot be flown with this seed, for example over the floor that it generates.
             TwinError: the world cannot be created (`open_world`).
         """
+        if not (seed is None or (seed == int(seed) and 0 <= seed < 2**32)):
+            raise TwinError("seed", f"{seed!r}", "a whole number from 0 to 4294967295")
         self.close()
         self._open.enter_context(one_blas_thread())
         scenario = self.mission.scenario

@@ -136,16 +136,12 @@ def _ratio(numerator: Array, denominator: Array) -> Array:
 def table(result: Agreement) -> list[tuple[str, ...]]:
     return [
         (
-            words(one.metric),
-            str(one.pairs),
-            _value(one.metric, one.rendered),
-            _value(one.metric, one.surrogate),
-            f"{one.ratio.value:.2f} ({one.ratio.low:.2f} to {one.ratio.high:.2f})",
-            f"{one.p_value:.3f}",
+            words(one.metric), str(one.pairs), _value(one.metric, one.rendered), _value(one.metric, one.surrogate),
+            f"{one.ratio.value:.2f} ({one.ratio.low:.2f} to {one.ratio.high:.2f})", f"{one.p_value:.3f}",
             _verdict(one.agrees),
         )
         for one in result.metrics
-    ]
+    ]  # fmt: skip
 
 
 def verdict_line(result: Agreement) -> str:

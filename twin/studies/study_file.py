@@ -80,7 +80,7 @@ class TuningConfig(Section):
     surrogate's results are corrected by those of the rendered surveys"""
     keep: KeepLevel | None = None
     """files to keep of rendered surveys; default: `keep` of the study"""
-    timeout_s: float = Field(default=7200.0, gt=0, le=1e7)
+    timeout_s: float = Field(default=7200.0, gt=0, le=2e6)
     """run time after which a rendered survey counts as failed [s]"""
 
 
@@ -97,7 +97,7 @@ class Study(Section):
     """a varied numeric key: report first where it reaches require.probability"""
     keep: KeepLevel = "metrics"
     """files to keep of each run"""
-    timeout_s: float = Field(default=3600.0, gt=0, le=1e7)
+    timeout_s: float = Field(default=3600.0, gt=0, le=2e6)
     """run time after which a survey counts as failed [s]"""
     retries: int = Field(default=2, ge=0, le=100)
     """retries if the process of a survey was killed"""

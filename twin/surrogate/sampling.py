@@ -107,8 +107,8 @@ def sample_link(
     weight = np.ones(n)
     observations = observation_equations.linearise(measured, b, earlier_from_later, baseline)
     normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, weight)
-    if n < MIN_POINTS:
-        return n, earlier_from_later, normal, np.zeros(8)
+    if n < MIN_POINTS or min(np.ptp(b[:, 0]), np.ptp(b[:, 1])) * focal < 1:  # points in a line determine no motion
+        return min(n, MIN_POINTS - 1), earlier_from_later, normal, np.zeros(8)
     inverse = np.linalg.inv(normal)
     motion = earlier_from_later @ geometry.exp(inverse @ right)
     for _ in range(_MORE_ITERATIONS if table.values.size or table.yaw_rad else 0):

@@ -183,7 +183,9 @@ class SurrogateVision:
             enough = len(hits) >= sampling.MIN_POINTS
             mean_m = float(depth_m[hits].mean()) if enough else math.nan
             seen, n_points = self._matched_points(hits, depth_m, mean_m) if enough else (hits, 0.0)
-            if n_points < _MIN_POINTS or len(seen) < sampling.MIN_POINTS:
+            # points of one row or column of the raster do not determine a motion
+            in_line = len(seen) > 0 and min(map(np.ptp, np.unravel_index(seen, _RASTER))) == 0
+            if n_points < _MIN_POINTS or len(seen) < sampling.MIN_POINTS or in_line:
                 self.stereo_observations.append(StereoObservation(row, int(n_points), None))
                 return None
             self._pose_at[row] = pose

@@ -180,15 +180,11 @@ def _groups(shown: list[Candidate], front: list[Candidate], result: TuningResult
     chosen = result.recommended or result.unproven
     label = "recommended" if result.recommended else "closest, not shown"
     star = {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": label}
+    unlikely = _DOT | {"color": COLOURS["f2f"], "alpha": 0.5, "label": "pass probability too low"}
+    feasible = _DOT | {"color": COLOURS["link"], "label": "feasible"}
     return [
-        (
-            [c for c in shown if c.shortfall > 0],
-            _DOT | {"color": COLOURS["f2f"], "alpha": 0.5, "label": "pass probability too low"},
-        ),
-        (
-            [c for c in shown if c.shortfall <= 0 and c not in front],
-            _DOT | {"color": COLOURS["link"], "label": "feasible"},
-        ),
+        ([c for c in shown if c.shortfall > 0], unlikely),
+        ([c for c in shown if c.shortfall <= 0 and c not in front], feasible),
         (front, _DOT | {"color": COLOURS["final"], "markersize": 5, "label": "Pareto-optimal"}),
         ([c for c in shown if chosen and c.number == chosen.number], _DOT | star),
     ]
