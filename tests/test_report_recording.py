@@ -470,8 +470,10 @@ def test_a_browser_of_this_machine_alone_is_served_until_ctrl_c(folder, monkeypa
         seen.update({port: listening_at(port) for port in (web, data)})
         os.kill(os.getpid(), signal.SIGINT)
 
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may start tests with SIGINT ignored
     threading.Thread(target=visit).start()
     assert recording.open_viewer(folder, web=True) == 0
+    signal.signal(signal.SIGINT, before)
     assert b"<html" in seen["page"] and seen[web] == seen[data] == ["0100007F"]  # 127.0.0.1
     assert capfd.readouterr().out.endswith(f"Closed {folder / 'run.rrd'}\n")
     deadline = time.monotonic() + 10
