@@ -41,4 +41,4 @@ def _pose_texts(poses: Array) -> list[str]:
 
 def _row_texts(rows: Array, number_format: str) -> list[str]:
     line = " ".join([number_format] * rows.shape[1]) + "\n"
-    return (line * len(rows) % tuple(rows.ravel().tolist())).splitlines()
+    return (line * len(rows) % tuple(rows.ravel().tolist())).replace("e+0", "e").splitlines()

@@ -39,7 +39,7 @@ _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
 _RENDERED_DISK_MB = _Coefficients(start=6.0, keyframe=0.033)  # without images
 _PAIR_MB_PER_MPX, _DISPARITY_MB_PER_MPX = 4.2, 4.0  # of the images of a frame; of a keyframe, in 16-bit numbers
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
-_RENDERED_MB = _Coefficients(start=555.0, frame=0.0045, keyframe_mpx=2.0)  # depths in half precision
+_RENDERED_MB = _Coefficients(start=555.0, frame=0.0045, keyframe_mpx=1.0)
 _IMAGES_MB_PER_MPX = 500.0
 _SURROGATE_MB = _Coefficients(start=507.0, frame=0.006)
 _REPORT_MB = 180.0  #: part of `start` of report and recording

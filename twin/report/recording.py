@@ -28,7 +28,7 @@ from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.scenario import file as scenario_file
 
 #: Largest number of keyframes with images, and of images sent at once; longest side of these and the orthomosaic [px].
-N_IMAGED, N_SENT, IMAGE_SIDE_PX, MOSAIC_PX = 500, 50, 320, 1600
+N_IMAGED, N_SENT, IMAGE_SIDE_PX, MOSAIC_PX = 200, 50, 320, 1600
 #: Largest number of snapshots of growing entities (paths, network, map), samples of a curve, and ellipsoids.
 N_SNAPSHOTS, N_SAMPLES, N_ELLIPSOIDS = 24, 5000, 200
 #: Half axes of the ellipsoids [standard deviations], and the largest one drawn as a share of the extent of the path.
