@@ -268,7 +268,7 @@ class Trajectory:
         return self.world_from_camera[:, :3, 3]
 
     def save(self, path: Path, digits: int = 9, header: str = "") -> None:
-        """Writes a TUM file: time x y z qx qy qz qw, one line per pose, of so many digits and 2 less decimals."""
+        """Writes a TUM file: time x y z qx qy qz qw, numbers of `digits` digits and at most `digits` - 2 decimals."""
         quaternions = geometry.quaternions_xyzw(self.world_from_camera[:, :3, :3])
         rows = np.round(np.column_stack([self.times_s, self.positions, quaternions]), digits - 2) + 0.0  # no -0
         line = "%.6f" + f" %.{digits}g" * 7 + "\n"

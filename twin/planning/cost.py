@@ -39,7 +39,7 @@ _SURROGATE_S = _Coefficients(start=10.6, keyframe=0.038)
 _RENDERED_DISK_MB = _Coefficients(start=6.0, keyframe=0.033)  # without images
 _PAIR_MB_PER_MPX, _DISPARITY_MB_PER_MPX = 4.2, 4.0  # of the images of a frame; of a keyframe, in 16-bit numbers
 _SURROGATE_DISK_MB = _Coefficients(start=4.8, keyframe=0.056)
-_RENDERED_MB = _Coefficients(start=555.0, frame=0.0045, keyframe_mpx=1.0)
+_RENDERED_MB = _Coefficients(start=555.0, frame=0.0045, keyframe=0.0125)
 _IMAGES_MB_PER_MPX = 500.0
 _SURROGATE_MB = _Coefficients(start=507.0, frame=0.006)
 _REPORT_MB = 180.0  #: part of `start` of report and recording
@@ -55,8 +55,7 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
     if mission.scenario.imaging.fidelity == "surrogate":
         disk_mb = _SURROGATE_DISK_MB.total(*size)
         return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB.total(*size), disk_mb, disk_mb)
-    share = min(1.0, (mission.scenario.estimator_settings().window_tracks + 1) / len(mission.tracks))
-    memory_mb = _RENDERED_MB.total(mission.n_frames, round(share * n_keyframes), megapixels) + _floor_mb(mission)
+    memory_mb = _RENDERED_MB.total(*size) + _floor_mb(mission)
     time_s = _RENDERED_S.total(*size) + (_OBJECTS_S.total(*size) if mission.objects else 0.0)
     n_kept = {"none": 0, "keyframes": n_keyframes, "all": mission.n_frames + n_keyframes}[mission.scenario.record]
     disk_mb = _RENDERED_DISK_MB.total(*size) + n_kept * megapixels * _PAIR_MB_PER_MPX

@@ -35,7 +35,7 @@ from twin.judge.recorded import (
     in_world,
     true_from_world,
     true_heights,
-)  # fmt: skip
+)
 from twin.plugin.guard import check_loadable
 from twin.plugin.loading import ESTIMATORS, source_files
 from twin.plugin.navigator import NOTE, Estimators, navigator_of
