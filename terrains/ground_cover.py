@@ -11,6 +11,7 @@ from twin.terrains.noise import cells, fractal_noise, lattice_table, value_noise
 
 GRAINS, STONES, CRACKS, POLYPS, BLADES, BURROWS, SHELLS = range(7)
 Colour = tuple[int, int, int]
+Part = tuple[int, int, int, int]  #: first row of an image, row after its last, and so its columns
 
 
 class Cover(NamedTuple):
@@ -49,30 +50,42 @@ DEFAULT_COVERS = {
 EDGE_M = 0.12  #: size of the largest lobes of the border between two materials [m]
 
 
-def paint(
-    material: NDArray[np.uint8], tone: NDArray[np.uint8], texel_m: float, cover: str, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """Returns the colours (rows, cols, 3) uint8 of a floor with the four materials of `cover`, a key of COVERS."""
-    # quarters of `material` belong to one each, with transitions; `tone` (rows, cols) is pink noise
-    covers = COVERS[cover]
-    bands = [np.array([c.dark, c.medium, c.bright]).T for c in covers]
-    tones = np.linspace(0.0, 1.0, 256)
-    ramps = np.array([[np.interp(tones, (0.0, 0.5, 1.0), band) for band in ramp] for ramp in bands], np.float32)
-    structure = np.array([c.structure for c in covers], np.int64)
-    numbers = np.array([[c.size_m, c.strength, c.noise] for c in covers])
-    ramps = np.ascontiguousarray(ramps.swapaxes(1, 2))
-    colour, table = np.empty((*material.shape, 3), np.uint8), lattice_table(rng)
-    arguments = material, tone, texel_m, ramps, structure, numbers, table, colour
-    in_row_bands(lambda first, end: _paint(*arguments, first, end), len(material))
-    return colour
+class Painting:
+    """Floor with the four materials of `cover`, a key of COVERS, each part of which is painted when it is asked for.
+
+    Quarters of `material` (rows, cols) belong to one of them each, with transitions; `tone` (rows, cols) is pink noise.
+    """
+
+    def __init__(
+        self, material: NDArray[np.uint8], tone: NDArray[np.uint8], texel_m: float, cover: str, rng: np.random.Generator
+    ):
+        covers = COVERS[cover]
+        bands = [np.array([c.dark, c.medium, c.bright]).T for c in covers]
+        tones = np.linspace(0.0, 1.0, 256)
+        ramps = np.array([[np.interp(tones, (0.0, 0.5, 1.0), band) for band in ramp] for ramp in bands], np.float32)
+        structure = np.array([c.structure for c in covers], np.int64)
+        numbers = np.array([[c.size_m, c.strength, c.noise] for c in covers])
+        ramps = np.ascontiguousarray(ramps.swapaxes(1, 2))
+        self._colour = np.zeros((*material.shape, 3), np.uint8)  # pages without colours take no RAM
+        self._inputs = material, tone, texel_m, ramps, structure, numbers, lattice_table(rng)
+        self._painted: list[Part] = []
+
+    def within(self, part: Part) -> NDArray[np.uint8]:
+        """Returns the colours (rows, cols, 3) uint8, which are painted at least in a part."""
+        top, bottom, left, right = part
+        if not any(t <= top and bottom <= b and n <= left and right <= r for t, b, n, r in self._painted):
+            arguments = *self._inputs, self._colour, left, right
+            in_row_bands(lambda first, end: _paint(*arguments, top + first, top + end), bottom - top)
+            self._painted.append(part)
+        return self._colour
 
 
 @kernel
-def _paint(material, tone, texel_m, ramps, structure, numbers, table, colour, first, end):
-    """Fills rows of `colour` (rows, cols, 3); ramps (4, 256, 3), structures (4,) and `numbers` (4, 3) of `Cover`."""
+def _paint(material, tone, texel_m, ramps, structure, numbers, table, colour, left, right, first, end):
+    """Fills a part of `colour` (rows, cols, 3); ramps (4, 256, 3), structures (4,) and `numbers` (4, 3) of `Cover`."""
     alike = [bool(np.all(ramps[k] == ramps[k + 1])) for k in range(3)]
     for r in range(first, end):
-        for c in range(material.shape[1]):
+        for c in range(left, right):
             noise = (tone[r, c] - 128.0) / 256.0
             x, y = c * texel_m, r * texel_m
             level = material[r, c] / 64.0 - 0.5  # 0, 1, 2, 3: nothing but one of the materials

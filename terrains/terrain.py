@@ -12,6 +12,7 @@ from twin.core.geometry import Array
 from twin.core.georeference import Georeference
 from twin.core.records import Image
 from twin.errors import TwinError
+from twin.terrains.ground_cover import Painting, Part
 
 
 class InputStatement(NamedTuple):
@@ -43,15 +44,23 @@ MAX_TEXELS = 250_000_000
 
 @dataclass(frozen=True)
 class PaintedTexture:
-    """Texture that is painted when its image is first asked for: plans and surrogate surveys need none."""
+    """Texture each part of which is painted when it is first asked for: plans and surrogate surveys need none."""
 
     shape: tuple[int, int, int]  #: (h, w, 3) of the image
-    paint: Callable[[], Image]
-    rng: np.random.Generator  #: from which `paint` takes random numbers
+    begin: Callable[[], Painting | Image]
+    rng: np.random.Generator  #: from which `begin` takes random numbers
 
     @cached_property
+    def begun(self) -> Painting | Image:
+        return self.begin()
+
+    def within(self, part: Part) -> Image:
+        """Returns the image, which is painted at least in a part."""
+        return self.begun.within(part) if isinstance(self.begun, Painting) else self.begun
+
+    @property
     def image(self) -> Image:
-        return self.paint()
+        return self.within((0, self.shape[0], 0, self.shape[1]))
 
 
 class Walls(NamedTuple):
@@ -102,10 +111,19 @@ class Terrain:
         """Returns `colours` as an image, painted at the first call."""
         return self.colours.image if isinstance(self.colours, PaintedTexture) else self.colours
 
+    def texture_within(self, low_m: Array, high_m: Array) -> Image:
+        """Returns `colours` as an image, which is painted at least between two corners (x, y) [m], and 4 texels on."""
+        if not isinstance(self.colours, PaintedTexture):
+            return self.colours
+        (rows, cols, _), corner_m = self.colours.shape, [self.west_m, self.south_m]
+        place = (np.array([low_m, high_m]) - corner_m) / self.size_m * [cols, rows]
+        (left, south), (right, north) = np.clip(np.round(place) + [[-4], [4]], 0, [cols, rows]).astype(int).tolist()
+        return self.colours.within((rows - north, rows - south, left, right))
+
     def free_texture(self) -> None:
         """Frees a painted texture, which cannot be painted again, as its random numbers are used up."""
         if isinstance(self.colours, PaintedTexture):
-            vars(self.colours)["image"] = None
+            vars(self.colours)["begun"] = None
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from twin.core.records import Image
 from twin.errors import TwinError
 from twin.terrains.file_header import TEXTURE_FIELD, decoded, eight_bits
-from twin.terrains.ground_cover import COVERS, paint
+from twin.terrains.ground_cover import COVERS, Painting
 from twin.terrains.noise import fractal_field, pink_noise
 from twin.terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
 from twin.terrains.terrain import PaintedTexture
@@ -46,16 +46,16 @@ class TextureSource:
 def painted_texture(
     cover: str, height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
 ) -> PaintedTexture:
-    """Returns the texture of `generate_texture`, not painted yet; raises TwinError if the cover is unknown."""
+    """Returns the texture of `begin_texture`, not begun yet; raises TwinError if the cover is unknown."""
     if cover not in COVERS:
         raise TwinError("terrain.cover", f"unknown cover {cover!r}", ", ".join(COVERS))
-    return PaintedTexture((*shape, 3), partial(generate_texture, cover, height_m, shape, texel_m, rng), rng)
+    return PaintedTexture((*shape, 3), partial(begin_texture, cover, height_m, shape, texel_m, rng), rng)
 
 
-def generate_texture(
+def begin_texture(
     cover: str, height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
-) -> Image:
-    """Returns a texture (rows, cols, 3) uint8 RGB, row 0 = north, of a height grid (ny, nx), row 0 = south.
+) -> Painting:
+    """Returns a texture (rows, cols, 3) to be painted, row 0 = north, of a height grid (ny, nx), row 0 = south.
 
     Height, slope and noise, in patches of up to 1 m, determine the material of a texel, one of those of `cover`, a key
     of `COVERS`; its structure and pink noise down to single texels determine the tone.
@@ -66,19 +66,19 @@ def generate_texture(
     down, right = np.gradient(north_up, spacing_m)
     patches = fractal_field(height_m.shape, 1.0 / spacing_m, 0.6, rng)
     height = (north_up - north_up.min()) / max(float(np.ptp(north_up)), 1e-6)
-    return paint(_material(height, np.hypot(down, right), patches, shape), tone, texel_m, cover, rng)
+    return Painting(_material(height, np.hypot(down, right), patches, shape), tone, texel_m, cover, rng)
 
 
-def generate_wall_texture(
+def begin_wall_texture(
     cover: str, shape: tuple[int, int], extent_m: tuple[float, float], spacing_m: float, floor: PaintedTexture
-) -> Image:
+) -> Painting:
     """Returns a texture (rows, cols, 3) of steep parts; rows run down from the floor's highest to its lowest point."""
-    _, rng = floor.image, floor.rng  # the random numbers after those of the floor
+    _, rng = floor.begun, floor.rng  # the random numbers after those of the floor
     tone = _tone(shape, rng)
     cols, rows = (max(2, round(extent / spacing_m) + 1) for extent in extent_m)
     patches = fractal_field((rows, cols), 1.0 / spacing_m, 0.6, rng)
     height = np.linspace(1.0, 0.0, rows, dtype=np.float32)[:, None]
-    return paint(_material(height, np.float32(_STEEP), patches, shape), tone, extent_m[0] / shape[1], cover, rng)
+    return Painting(_material(height, np.float32(_STEEP), patches, shape), tone, extent_m[0] / shape[1], cover, rng)
 
 
 def _tone(shape: tuple[int, int], rng: np.random.Generator) -> Image:

@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter
 
 from twin.core.records import Mask
 from twin.terrains.terrain import PaintedTexture, Walls
-from twin.terrains.textures import TextureSource, generate_wall_texture, texture_from_photo
+from twin.terrains.textures import TextureSource, begin_wall_texture, texture_from_photo
 
 #: Cosines of the slope from which on walls have a texture of their own (50 deg), and no other (65 deg).
 STEEP_COSINE, WALL_COSINE = 0.643, 0.423
@@ -41,10 +41,10 @@ def walls_of(
     texel_m = max(texel_m, float(np.sqrt(length_m * rise_m / WALL_TEXELS)))
     shape = max(2, round(rise_m / texel_m)), max(2, round(length_m / texel_m))
     if source.photo_file is not None:
-        paint = partial(texture_from_photo, source, shape, (length_m, rise_m))
+        begin = partial(texture_from_photo, source, shape, (length_m, rise_m))
     else:
-        paint = partial(generate_wall_texture, cover, shape, (length_m, rise_m), spacing_m, floor)
-    return Walls(*found, PaintedTexture((*shape, 3), paint, floor.rng), length_m, low_m, high_m)
+        begin = partial(begin_wall_texture, cover, shape, (length_m, rise_m), spacing_m, floor)
+    return Walls(*found, PaintedTexture((*shape, 3), begin, floor.rng), length_m, low_m, high_m)
 
 
 def wall_weights(

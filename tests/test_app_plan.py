@@ -18,7 +18,7 @@ from twin.planning.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
 from twin.surrogate.matchability import EVEN_TEXTURE, WindowTexture, _generated
-from twin.terrains.ground_cover import paint
+from twin.terrains.ground_cover import Painting
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import prepare
 
@@ -142,7 +142,9 @@ def test_the_summary_counts_the_objects_and_names_a_surrogate_that_leaves_them_o
 def test_a_plan_does_not_paint_its_floor(fidelity, monkeypatch):
     """The matching precision needs the texture of a part of it, as large as an image."""
     painted = []
-    monkeypatch.setattr("twin.terrains.textures.paint", lambda *given: painted.append(given[0].size) or paint(*given))
+    monkeypatch.setattr(
+        "twin.terrains.textures.Painting", lambda *given: painted.append(given[0].size) or Painting(*given)
+    )
     _generated.cache_clear()
     given = summary_of(f"imaging.fidelity={fidelity}", "terrain.texture_px_m=0.02")
     assert given.cost.memory_mb > 0 and given.mission.terrain.size_m == (9.0, 7.0)

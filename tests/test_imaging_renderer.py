@@ -240,6 +240,29 @@ def test_images_are_copies_and_rendering_is_reproducible(terrain: Terrain) -> No
     assert np.array_equal(again[0], albedo) and np.array_equal(again[1], depth)
 
 
+@pytest.mark.parametrize(
+    ("floor", "texel_m", "tilts_rad"), [("reef", 0.003, (0.0, 0.3, 1.2)), ("flat", 0.001, (0.0, 0.45))]
+)
+def test_images_over_a_texture_that_is_painted_in_part_are_those_over_the_whole(floor, texel_m, tilts_rad) -> None:
+    """The part is just the footprint; with the horizon in an image, and when one shows more, it is the whole."""
+    size_m = 2400 * texel_m, 1600 * texel_m
+    floors = [
+        terrains.generate(floor, size_m, 0.5, 0.1, 0.04, TextureSource(texel_m), 5) for _ in (0.0, *tilts_rad)
+    ]  # fmt: skip
+    all_over, shares, rng = Renderer(floors.pop(), W, H, FOCAL_PX), list[float](), np.random.default_rng(3)
+    for terrain, tilt_rad in zip(floors, tilts_rad, strict=True):
+        rotation = geometry.rotation_from_rpy(tilt_rad, rng.uniform(-0.2, 0.2), rng.uniform(-3, 3))
+        place = np.array([*rng.uniform(-0.2, 0.2, 2), size_m[1] / 6])
+        pose = geometry.pose(rotation @ geometry.BODY_FROM_DOWN_CAMERA, place)
+        partly = Renderer(terrain, W, H, FOCAL_PX, all_over.footprint(pose))
+        further = geometry.pose(pose[:3, :3], place + [0.5, 0.0, 0.0])
+        for k, view in enumerate((pose, further)):
+            assert all(np.array_equal(*pair) for pair in zip(partly.render(view), all_over.render(view), strict=True))
+            if k == 0:
+                shares.append(float(terrain.texture_within(place[:2], place[:2]).any(axis=2).mean()))
+    assert shares[0] < 0.3 and (floor == "flat" or shares[-1] == 1.0)
+
+
 def test_the_image_does_not_depend_on_the_number_of_bands(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
     images = []
     for processors in (1, 2):

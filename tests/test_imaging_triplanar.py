@@ -134,7 +134,7 @@ def test_two_views_of_a_wall_show_the_same_albedo() -> None:
     blurred = cv2.GaussianBlur(of_walls.image, (0, 0), 4)
     smooth = replace(
         terrain, colours=cv2.GaussianBlur(terrain.texture, (0, 0), 4),
-        walls=terrain.walls._replace(texture=replace(of_walls, paint=lambda: blurred)),
+        walls=terrain.walls._replace(texture=replace(of_walls, begin=lambda: blurred)),
     )  # fmt: skip
     first = looking(np.array([0.2, 0.1, -1.0]), np.zeros(3), 2.2)
     second = first @ geometry.pose(geometry.rotation_from_rpy(0.1, -0.15, 0.6), np.array([0.3, -0.1, 0.1]))
@@ -182,7 +182,7 @@ def test_a_uniform_colour_of_floor_and_walls_is_exact() -> None:
     assert terrain.walls is not None
     colour = np.array([200, 17, 93], np.uint8)
     of_walls = terrain.walls.texture
-    plain = replace(of_walls, paint=lambda: np.full(of_walls.shape, colour, np.uint8))
+    plain = replace(of_walls, begin=lambda: np.full(of_walls.shape, colour, np.uint8))
     walls = terrain.walls._replace(texture=plain)
     painted = replace(terrain, colours=np.full_like(terrain.texture, colour), walls=walls)
     ((albedo, depth),) = render(painted, looking(np.array([0.5, 0.2, -1.0]), np.zeros(3), 2.0))

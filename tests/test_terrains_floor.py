@@ -12,8 +12,8 @@ import pytest
 from twin import terrains
 from twin.errors import TwinError
 from twin.terrains import Terrain, TextureSource
-from twin.terrains.ground_cover import COVERS, GRAINS, Cover, paint
-from twin.terrains.textures import COARSEN_TEXELS, generate_texture
+from twin.terrains.ground_cover import COVERS, GRAINS, Cover, Painting
+from twin.terrains.textures import COARSEN_TEXELS, painted_texture
 
 KINDS = ("ripples", "fractal", "reef", "cliffs")
 
@@ -62,7 +62,7 @@ def test_a_texture_painted_later_is_that_painted_at_once_also_before_and_after_t
         terrains.generate("reef", (3.0, 2.0), 0.9, 0.0, 0.05, TextureSource(0.01, walls=True), 1) for _ in range(2)
     )
     copy = pickle.loads(pickle.dumps(first))
-    at_once = generate_texture("reef", first.height_m, (200, 300), 0.01, np.random.default_rng(1).spawn(2)[1])
+    at_once = painted_texture("reef", first.height_m, (200, 300), 0.01, np.random.default_rng(1).spawn(2)[1]).image
     assert first.walls is not None and second.walls is not None
     of_walls = first.walls.texture.image  # before the floor
     assert np.array_equal(first.texture, at_once) and np.array_equal(second.texture, at_once)
@@ -73,11 +73,32 @@ def test_a_texture_painted_later_is_that_painted_at_once_also_before_and_after_t
 
 def test_a_texture_is_painted_when_it_is_asked_for_and_once_for_all_copies_of_a_floor(monkeypatch) -> None:
     painted = []
-    monkeypatch.setattr("twin.terrains.textures.paint", lambda *given: painted.append(1) or paint(*given))
+    monkeypatch.setattr("twin.terrains.textures.Painting", lambda *given: painted.append(1) or Painting(*given))
     terrain = floor("reef")
     raised = replace(terrain, height_m=terrain.height_m + 1)
     assert not painted
     assert raised.texture is terrain.texture and len(painted) == 1
+
+
+def test_parts_of_a_texture_are_those_of_the_whole_and_no_part_is_painted_twice(monkeypatch) -> None:
+    terrain, whole = floor("reef", size_m=(4.0, 3.0)), floor("reef", size_m=(4.0, 3.0)).texture
+    bands = []
+    monkeypatch.setattr(
+        "twin.terrains.ground_cover.in_row_bands", lambda work, n: bands.append(n) or work(0, n // 2) or work(n // 2, n)
+    )
+    part = terrain.texture_within(np.array([-1.5, 0.2]), np.array([0.5, 9.0]))  # beyond the north edge
+    assert part.shape == whole.shape
+    painted = part.any(axis=2)
+    rows, cols = np.flatnonzero(painted.any(axis=1)), np.flatnonzero(painted.any(axis=0))
+    texel_m = terrain.texture_px_m
+    # rows from the north edge down to y = 0.2 m, columns from x = -1.5 to 0.5 m, and four texels more on each side
+    assert (rows[0], rows[-1] + 1) == (0, round((1.5 - 0.2) / texel_m) + 4)
+    assert (cols[0], cols[-1] + 1) == (round(0.5 / texel_m) - 4, round(2.5 / texel_m) + 4)
+    inner = np.ix_(rows, cols)
+    assert np.array_equal(part[inner], whole[inner]) and len(rows) * len(cols) < 0.4 * painted.size
+    assert terrain.texture_within(np.array([-1.0, 0.3]), np.array([0.0, 1.0])) is part and len(bands) == 1
+    assert np.array_equal(terrain.texture, whole) and len(bands) == 2
+    assert terrain.texture_within(np.array([-2.0, -1.0]), np.array([2.0, 1.0])) is part and len(bands) == 2
 
 
 def test_a_reef_is_steep_but_not_beyond_sixty_degrees() -> None:
@@ -131,7 +152,8 @@ def test_the_material_changes_gradually() -> None:
     plain = [Cover(c, c, c, GRAINS, 1.0, 0.0, 0.0) for c in ((40, 40, 40), (200, 200, 200))]
     COVERS["test"] = (plain[0], plain[1], plain[1], plain[1])
     try:
-        painted = paint(material, np.full_like(material, 128), 0.005, "test", np.random.default_rng(1))
+        painting = Painting(material, np.full_like(material, 128), 0.005, "test", np.random.default_rng(1))
+        painted = painting.within((0, *material.shape[:1], 0, material.shape[1]))
     finally:
         del COVERS["test"]
     grey = painted[..., 0].astype(int)

@@ -37,7 +37,7 @@ from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
 from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.terrain import texture_shape
-from twin.terrains.textures import generate_texture
+from twin.terrains.textures import painted_texture
 
 TEXTURE_WINDOW_PX = 5  #: side of the windows of dense matching, with about the area of that of `epipolar`
 #: Bound above which fewer than two thirds of the corners are matched, so that the estimators bin the images [px]. In
@@ -360,7 +360,8 @@ def _painted_centre(scenario: Scenario, terrain: terrains.Terrain, extent_m: flo
     texel_m = terrains.TextureSource(scenario.texel_m, coarsen=True).texel_m((size_m[0], size_m[1]))
     shape = texture_shape(height_m.shape, terrain.spacing_m, texel_m)
     cover = scenario.terrain.cover or DEFAULT_COVERS["file"]
-    return generate_texture(cover, height_m, shape, texel_m, np.random.default_rng(scenario.seed_of_scene)), texel_m
+    rng = np.random.default_rng(scenario.seed_of_scene)
+    return painted_texture(cover, height_m, shape, texel_m, rng).image, texel_m
 
 
 def _albedo(texture: Image, texel_m: float, rig: StereoRig, depth_m: float) -> Image:

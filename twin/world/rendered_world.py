@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import Image, MapGrid
+from twin.core.records import Array, Image, MapGrid
 from twin.core.timing import StageTimer
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.scene.renderer import Renderer
@@ -49,7 +49,7 @@ class RenderedWorld(World):
         sensors = NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project, imu)
         super().__init__(mission, stopwatch, vehicle, sensors)
         floor, objects = mission.rendered_terrain, mission.rendered_objects()
-        self.renderer = Renderer(floor, rig.width_px, rig.height_px, rig.focal_px)
+        self.renderer = Renderer(floor, rig.width_px, rig.height_px, rig.focal_px, _seen_floor(mission))
         self._image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
         noise_rngs = rng["left_camera"], rng["right_camera"]
         self.camera = StereoCamera(self.renderer, self._image_formation, scenario, *noise_rngs, stopwatch, cameras)
@@ -92,6 +92,12 @@ class RenderedWorld(World):
 
     def seen(self) -> NDArray[np.bool_]:
         return self.coverage.seen
+
+
+def _seen_floor(mission: Mission) -> tuple[Array, Array]:
+    """Returns two corners (x, y) [m] between which all images lie if the vehicle stays near its path."""
+    (x, y), margin_m = mission.grid.centres(), 1.0 + max(mission.plan.request.footprint_m) / 2
+    return np.array([x[0], y[-1]]) - margin_m, np.array([x[-1], y[0]]) + margin_m
 
 
 def _overhanging_surface(mission: Mission, grid: MapGrid) -> TopSurface | None:

@@ -115,7 +115,7 @@ def true_albedo(terrain: Terrain, grid: MapGrid) -> NDArray[np.float32]:
     Over at least one sample per texel along x and y, interpolated bilinearly as in a rendered image; walls have their
     own texture (`imaging.triplanar`). NaN in cells whose middle sample lies outside the terrain.
     """
-    rows, cols, _ = terrain.texture.shape
+    rows, cols, _ = terrain.colours.shape
     texel_m = np.array(terrain.size_m) / [cols, rows]
     n = max(1, int(np.ceil(grid.cell_m / texel_m.min() - 1e-6)))
     step_m = grid.cell_m / n
@@ -129,9 +129,11 @@ def true_albedo(terrain: Terrain, grid: MapGrid) -> NDArray[np.float32]:
         for left in range(0, grid.cols, side):
             part = out[top : top + side, left : left + side]
             of_cols, of_rows = slice(left * n, (left + side) * n), slice(top * n, (top + side) * n)
-            source = _cropped(terrain.texture, *np.meshgrid(col[of_cols], row[of_rows]))
+            xs, ys = x[of_cols], y[of_rows]
+            texture = terrain.texture_within(np.array([xs[0], ys[-1]]), np.array([xs[-1], ys[0]]))
+            source = _cropped(texture, *np.meshgrid(col[of_cols], row[of_rows]))
             fine = np.asarray(cv2.remap(*source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-            paint_walls_from_above(terrain, walls, fine, x[of_cols], y[of_rows], step_m)
+            paint_walls_from_above(terrain, walls, fine, xs, ys, step_m)
             part[:] = fine.reshape(len(part), n, -1, n, 3).mean(axis=(1, 3), dtype=np.float32)
     inside_x = (x[n // 2 :: n] >= terrain.west_m) & (x[n // 2 :: n] <= terrain.east_m)
     inside_y = (y[n // 2 :: n] >= terrain.south_m) & (y[n // 2 :: n] <= terrain.north_m)

@@ -29,12 +29,14 @@ class FloorSurface(NamedTuple):
     per_m: Array  # (2,) texels per metre along x and y
 
 
-def floor_surface(terrain: Terrain) -> FloorSurface:
-    rows, cols, _ = terrain.texture.shape
+def floor_surface(terrain: Terrain, low_m: Array, high_m: Array) -> FloorSurface:
+    """Returns the floor with a texture that is painted at least between two corners (x, y) [m]."""
+    texture = terrain.texture_within(low_m, high_m)
+    rows, cols, _ = texture.shape
     per_m = np.array([cols, rows]) / terrain.size_m
     corner_m = np.array([terrain.west_m, terrain.south_m, terrain.highest_m])
-    height, texture = np.ascontiguousarray(terrain.height_m, np.float32), levels_of(terrain.texture)
-    return FloorSurface(height, texture, wall_surface(terrain), corner_m, terrain.spacing_m, per_m)
+    height = np.ascontiguousarray(terrain.height_m, np.float32)
+    return FloorSurface(height, levels_of(texture), wall_surface(terrain), corner_m, terrain.spacing_m, per_m)
 
 
 def paint_floor(
