@@ -44,7 +44,7 @@ class Link(NamedTuple):
 _LINK = np.dtype(
     [
         ("i", int), ("j", int), ("i_from_j", float, (4, 4)), ("information", float, (6, 6)), ("overlap", float),
-        ("n_points", int), ("shared_by", float), ("closed_form", float, (4, 4)), ("by_yaw", float, (6,)),
+        ("n_points", int), ("shared_by", float), ("closed_form", np.float32, (4, 4)), ("by_yaw", float, (6,)),
         ("yaw_rad", float), ("by_image_errors", np.float32, (6, 18)),
     ]
 )  # fmt: skip
@@ -105,7 +105,7 @@ class Links(Sequence[Link]):
         i, j, i_from_j, information, overlap, n_points, shared_by, form, by_yaw, yaw_rad, by_errors = self.table[k]
         numbers = float(overlap), int(n_points), float(shared_by)
         cov = symmetric_inverses(information[None])[0]
-        form = None if np.isnan(form[0, 0]) else form
+        form = None if np.isnan(form[0, 0]) else form.astype(np.float64)
         return Link(int(i), int(j), i_from_j, cov, *numbers, form, by_yaw, float(yaw_rad), by_errors)
 
     @property
@@ -121,7 +121,7 @@ class Links(Sequence[Link]):
         """Returns the mask (n,) of the links that have a closed-form motion, and these motions (m, 4, 4)."""
         forms = self.table["closed_form"]
         known = ~np.isnan(forms[:, 0, 0])
-        return known, forms[known]
+        return known, forms[known].astype(np.float64)
 
     @property
     def table(self) -> NDArray[Any]:

@@ -2,9 +2,11 @@
 
 import sys
 import time
+from array import array
 from collections import defaultdict
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ class Stopwatch:
     """Stopwatch that collects the durations of named stages: `with watch("f2f"): ...`; `now` is its clock [s]."""
 
     def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
-        self._durations_s: dict[str, list[float]] = defaultdict(list)
+        self._durations_s: dict[str, array[float]] = defaultdict(partial(array, "d"))
         self._now = now
 
     @contextmanager
@@ -30,11 +32,11 @@ class Stopwatch:
             self._durations_s[stage].append(self._now() - start)
 
     def durations_ms(self, stage: str) -> list[float]:
-        return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, [])]
+        return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, ())]
 
     def summary(self) -> dict[str, dict[str, float | int | None]]:
         """Returns count, total [s], mean and 95th percentile [ms] (None for count 0) of all `STAGES`."""
-        return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}
+        return {stage: _summary(self._durations_s.get(stage, ())) for stage in STAGES}
 
 
 def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
@@ -52,7 +54,7 @@ def _peak_rss_mb() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def _summary(durations_s: list[float]) -> dict[str, float | int | None]:
+def _summary(durations_s: Sequence[float]) -> dict[str, float | int | None]:
     if not durations_s:
         return {"count": 0, "mean_ms": None, "p95_ms": None, "total_s": 0.0}
     ms = np.array(durations_s) * 1e3

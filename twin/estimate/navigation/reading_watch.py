@@ -1,5 +1,6 @@
 """Watch over the navigation sensors: readings that repeat are removed, and long gaps between readings are reported."""
 
+from array import array
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ class ReadingWatch:
         self._last: dict[str, np.ndarray] = {}
         self._n_equal, self._since_s = dict.fromkeys(_NAMES, 0), dict.fromkeys(_NAMES, 0.0)
         self._n_removed = dict.fromkeys(_NAMES, 0)
-        self._times_s: dict[str, list[float]] = {name: [] for name in _NAMES}
+        self._times_s = {name: array("d") for name in _NAMES}
         self._now_s = 0.0
 
     def fresh(self, readings: Readings, time_s: float) -> Readings:
