@@ -74,11 +74,13 @@ def _break(plan: SurveyPlan, task: Task, hold_s: float) -> _Break:
     ends, time_s = list[tuple[_Break, float, float]](), 0.0
     for number, path in enumerate(plan.paths, 1):
         for k, segment in enumerate(path, 1):
-            if task.within_leg and isinstance(segment, Line) and segment.profile.length_m > 2 * _LEAST_M:
+            is_leg = number != plan.cross_track  # cross lines are flown to their end
+            if task.within_leg and is_leg and isinstance(segment, Line) and segment.profile.length_m > 2 * _LEAST_M:
                 ends.append(_nearest_within(segment, _Break(number, k), time_s, task))
             time_s += segment.profile.duration_s
             away_m = math.dist(end_of([segment])[:2], task.centre_m)
-            ends.append((_Break(number, k), time_s, away_m))
+            if is_leg or k == len(path):
+                ends.append((_Break(number, k), time_s, away_m))
         time_s += hold_s
     if task.start_s is not None:
         return next((at for at, end_s, _ in ends if end_s >= task.start_s), ends[-1][0])

@@ -129,3 +129,17 @@ def test_legs_over_gaps_are_flown_to_the_nearest_next():
     np.testing.assert_allclose(ends, [legs[1][1], legs[1][0], legs[0][0], legs[0][1]])
     for a, b in pairwise(path):
         np.testing.assert_allclose(a.points()[-1], b.points()[0])
+
+
+@pytest.mark.parametrize("within_leg", [False, True])
+@pytest.mark.parametrize("by_time", [False, True])
+def test_a_task_does_not_interrupt_the_cross_lines(within_leg, by_time):
+    """It is nearest to a corner between them, or begins while they are flown."""
+    level = plan(REQUEST._replace(cross_lines=3))
+    corner = level.paths[level.cross_track - 1][1].points()[0][:2]
+    begins_s = sum(level.track_duration_s(k) + HOLD_S for k in range(1, level.cross_track)) + 1.0
+    near = task(centre_m=tuple(corner - 0.1 * np.sign(corner)), within_leg=within_leg)
+    survey = with_tasks(level, [near._replace(start_s=begins_s) if by_time else near], HOLD_S)
+    lines = positions(survey)[survey.cross_track - 1]
+    np.testing.assert_allclose(lines, positions(level)[level.cross_track - 1])
+    assert not by_time or survey.detours[0].track == survey.n_tracks

@@ -59,6 +59,12 @@ def test_images_of_unequal_times_are_paired_with_the_nearest_one():
     assert n_right_only == 1
 
 
+def test_images_that_are_listed_twice_are_paired():
+    left, right = ([ImageTime(0.1 * (k // 2) + late, Path(f"{k}")) for k in range(8)] for late in (0.0, 0.001))
+    frames, _ = pair_by_time(left, right)
+    assert all(frame.right is not None for frame in frames)
+
+
 def test_pairs_of_unsynchronised_cameras_are_named():
     left, right = ([ImageTime(0.2 * k + late, Path(f"{k}")) for k in range(5)] for late in (0.0, 0.02))
     with pytest.raises(TwinError, match=r"two cameras differ by 20 ms \(median\) .*up to 10 ms"):
@@ -121,6 +127,8 @@ def test_an_impossible_calibration_is_one_line_with_its_file(tmp_path, write, ch
             "more than 100000 values",
         ),
         ("M1: &a [*a]", "a value that contains itself"),
+        ("M1: [500, 0, 160]\nD1: [0, 0]\nM1: [600, 0, 160]", "'M1' is given twice"),
+        ("cam0: {resolution: [640, 480], intrinsics: [1], intrinsics: [2]}", "'intrinsics' is given twice"),
     ],
 )
 def test_a_hostile_yaml_file_runs_no_code_and_takes_no_memory(tmp_path, text, message):
@@ -546,6 +554,7 @@ def test_a_focal_length_far_below_the_image_size_is_refused(tmp_path):
         ([str(170_000_000_000_000_000 + k * 10**8) for k in range(3)], "the time of 0000.png is 1.7e.17 s"),
         (["0.0", "5e-324", "1e-323"], "the median interval between its frames is 4.94066e-324 s"),
         (["100.0", "100.000000001", "100.000000002"], "the median interval between its frames is 9.99997e-10 s"),
+        (["0", "100000000", "200000000"], r"the median interval between its frames is 1e\+08 s"),
     ],
 )
 def test_times_that_cannot_be_seconds_are_refused(tmp_path, times, problem):

@@ -134,6 +134,7 @@ def test_velocities_are_interpolated_and_their_noise_is_that_of_a_frame():
         15.0,
     )
     assert gapped.at(0.5).dvl_mps is not None and gapped.at(1.0).dvl_mps is None
+    assert gapped.at(0.6).dvl_mps is not None and gapped.at(1.6).dvl_mps is not None  # at the ends of the gap
 
 
 def test_an_attitude_belongs_to_the_frame_within_ten_milliseconds():

@@ -97,6 +97,16 @@ def test_colmap_reads_the_model_and_its_points_reproject_where_they_are_observed
     np.testing.assert_allclose(relative.matrix(), contents.true.left_from_right[:3], atol=1e-12)
 
 
+def test_points_outside_the_field_are_not_observed_where_the_distortion_folds_back():
+    camera = replace(rectified_calibration(RIG).left, distortion=np.array([-0.2, 0.0, 0.0, 0.0, 0.0]))
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-9, 9, 181), np.linspace(-9, 9, 181)))
+    points = np.column_stack([x, y, np.full(len(x), 2.0)])
+    _, seen = colmap._observed(points, camera)
+    width, height = camera.size_px
+    in_field = (np.abs(points[seen, :2]) / 2.0 < [0.75 * width / RIG.fx_px, 0.75 * height / RIG.fy_px]).all(axis=1)
+    assert len(seen) > 100 and in_field.all()
+
+
 def test_points_triangulated_by_colmap_are_those_of_the_map(contents, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     model, _ = colmap.export(contents, tmp_path)

@@ -591,9 +591,11 @@ def test_images_along_a_path_show_the_floor_from_its_poses(tmp_path):
         assert np.abs(recorded.astype(int) - image.astype(int)).mean() < 0.6
     written = export(tmp_path / "run", ["truth"], tmp_path)
     assert written and (tmp_path / "truth" / "depth" / "000005.tiff").is_file()
-    below = path.world_from_camera.copy()
+    below, outside = path.world_from_camera.copy(), path.world_from_camera.copy()
     below[:, 2, 3] -= 9.0
+    outside[1:, 0, 3] += 1e4
     wrong = {
+        "not over the terrain": Trajectory(path.times_s, outside),
         "above the floor": Trajectory(path.times_s, below),
         "do not increase": Trajectory(path.times_s[::-1].copy(), path.world_from_camera),
     }

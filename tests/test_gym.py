@@ -198,7 +198,16 @@ def test_contact_ends_an_episode_without_images_and_rewards_can_be_given():
     assert terminated and "contact of the hull with the floor" in info["ended"] and -1.5 < reward < 0
 
 
-@pytest.mark.parametrize(("options", "message"), [({"observe": ("left",)}, "observe"), ({"frames": 0}, "frames")])
+@pytest.mark.parametrize(("options", "message"), [
+    ({"observe": ("left",)}, "observe"), ({"frames": 0}, "frames"), ({"reward": "coverage"}, "reward: 'coverage'"),
+])  # fmt: skip
 def test_options_of_the_environment_without_images_are_checked(options, message):
     with pytest.raises(TwinError, match=message):
         state_env(**options)
+
+
+def test_the_availability_of_readings_is_observed_without_them():
+    both, alone = (
+        state_env(observe=observe).reset(seed=1)[0] for observe in (("available", "readings"), ("available",))
+    )
+    assert both["available"].any() and np.array_equal(both["available"], alone["available"])

@@ -216,3 +216,11 @@ def test_a_survey_blind_for_three_seconds_is_flown_to_the_end(monkeypatch):
     assert off_m.max() < 0.15
     step_m = np.linalg.norm(np.diff(truth.reference, axis=0), axis=1)
     assert step_m.max() < 1.05 * mission().plan.speed_mps / RATE_HZ
+
+
+def test_an_additional_keyframe_at_the_planned_speed_changes_no_frame():
+    times_s = mission().planned_frames(1).path_times_s
+    rest = mission().next_frames(1, float(times_s[9]), Pace(1.0, 0.0, True))
+    np.testing.assert_allclose(rest.path_times_s, times_s[10:])
+    planned = mission().planned_frames(1).keyframe[10:]
+    assert rest.keyframe[0] and np.array_equal(rest.keyframe[1:], planned[1:]) and not planned[0]

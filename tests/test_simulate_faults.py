@@ -314,3 +314,11 @@ def test_images_are_dark_while_the_lamps_are_out(tmp_path):
             frame = world.step(command)
     dark = [level for time_s, level in levels if 2 <= time_s < 4 - 1e-9]
     assert max(dark) < 3 < 50 < min(level for time_s, level in levels if time_s < 2 or time_s > 6)
+
+
+def test_gusts_in_quick_succession_make_no_step():
+    """A gust rises and falls within 1 s: by at most 1.5 times its speed in one second (a cubic)."""
+    given = {"part": "water", "type": "gust", "per_hour": 3600.0, "duration_s": 2.0, "size": 1.0, "direction_deg": 0.0}
+    times_s, flow = gust_flow(given, end_s=60.0)
+    assert np.ptp(flow[:, 0, 0]) > 0.9
+    assert np.abs(np.diff(flow[:, 0, 0])).max() <= 1.5 * (times_s[1] - times_s[0]) + 1e-9

@@ -94,6 +94,8 @@ def test_the_spectrum_of_the_orbital_velocity_follows_from_that_of_the_waves(wav
 @pytest.mark.parametrize(("waves", "height_m", "period_s"), [
     (WavesConfig(height_m=1.0, period_s=6, depth_m=10), 1.0, 6.0),
     (WavesConfig(wind_mps=10.0, fetch_m=50_000, depth_m=100), 1.14, 4.95),
+    # fully developed (Shore Protection Manual 1984): g H / U^2 = 0.2433, g T / U = 8.134
+    (WavesConfig(wind_mps=5.0, fetch_m=1e6, depth_m=100), 0.2433 * 25 / 9.81, 8.134 * 5 / 9.81),
 ])  # fmt: skip
 def test_the_components_have_the_variance_of_the_significant_height(waves, height_m, period_s):
     components = sea_of(Scenario(waves=waves)).waves.components
@@ -252,3 +254,9 @@ def test_gusts_may_be_vertical_only():
     current = CurrentConfig(gust_vertical_mps=0.3)
     gusts = gust_series(current, np.random.default_rng(1))
     assert not current.is_still and gusts[:, 2].std() == pytest.approx(0.3, rel=0.1) and not gusts[:, :2].any()
+
+
+def test_other_columns_of_a_current_file_may_be_text(tmp_path):
+    file = tmp_path / "current.csv"
+    file.write_text("time_s,quality,height_m,east_mps,north_mps\n0,good,0,0.1,0.2\n")
+    assert velocities(sea_of(Scenario(current=CurrentConfig(file=str(file)))), [0.0])[0] == pytest.approx([0.1, 0.2, 0])

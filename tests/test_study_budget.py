@@ -151,3 +151,19 @@ def test_without_a_terminal_progress_is_printed_regularly(monkeypatch, capsys):
         time.sleep(0.2)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) >= 3 and lines[-1].startswith("1 of 3 surveys, 100 % pass (21 to 100 %), about ")
+
+
+def test_a_study_of_fewer_samples_may_have_no_survey_left_to_fly_rendered(tmp_path):
+    text = STUDY.replace("lhs", "random") + '[set]\nimaging.fidelity = "surrogate"\n'
+
+    def run(study, resume, fly, **options):
+        fleet = runner.Fleet(SerialEngine(), StudyProgress(), fly)
+        return runner.run_study(study, tmp_path / "out", resume, fleet, **options).analysis
+
+    def refusing_the_last(survey):
+        refused = row_of(survey, "refused", "imaging.fidelity: too turbid") | {"unmodelled": True}
+        return refused if survey.sample >= 6 else fly(survey)
+
+    run(study_of(tmp_path, text), False, refusing_the_last)
+    known = run(study_of(tmp_path, text, ("samples = 12", "samples = 6")), True, fly, render_refused=True)
+    assert known.n_rendered == 0 and known.evaluated.any()

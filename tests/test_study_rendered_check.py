@@ -69,6 +69,18 @@ def test_the_worst_metric_counts_and_a_lower_limit_is_missed_from_below(tmp_path
     assert nearest_surveys(analysis, 3).tolist() == [0, 11, 1]
 
 
+def test_a_metric_that_can_be_negative_is_as_close_to_its_limit_as_its_size(tmp_path):
+    text = STUDY.replace('"map.le90_m" = 0.02', '"map.bias_m" = 0.02')
+    study, log = study_of(tmp_path, text), ResultsLog(tmp_path)
+    biases_m = [-0.05, -0.021, -0.019, 0.0, 0.004, 0.03, *[0.0] * 6]
+    for survey, bias_m in zip(surveys(study, tmp_path), biases_m, strict=True):
+        row = row_of(survey, "complete", "") | {"map.bias_m": bias_m, "map.completeness": 0.99}
+        required = {"require.map.bias_m.limit": 0.02, "require.map.bias_m.passed": abs(bias_m) <= 0.02}
+        log.add(row | required | {"require.map.completeness.limit": 0.9, "require.map.completeness.passed": True})
+    analysis = StudyAnalysis(log.table(), study)
+    assert {biases_m[k] for k in nearest_surveys(analysis, 2)} == {-0.021, -0.019}
+
+
 class Calls:
     """Engine that calls a function in place of the one that flies surveys, and counts the calls."""
 

@@ -295,3 +295,13 @@ def test_image_quality_includes_aborted_surveys_and_a_metric_without_values_is_n
     assert analysis.metrics == ["map.le90_m", "vision.points_median"]
     correlations = {s.metric: s.correlation.value for s in analysis.sensitivities if s.key == "water.turbidity"}
     assert correlations["vision.points_median"] < -0.5 < 0.5 < correlations["map.le90_m"]
+
+
+def test_the_bound_of_a_metric_that_can_be_negative_is_that_of_its_size(tmp_path):
+    study = study_of(tmp_path, STUDY, ('show = ["map.le90_m"]', 'show = ["map.bias_m"]'))
+    biases_m = np.random.default_rng(0).uniform(-0.055, -0.05, 12)
+    analysis = analyse(study, tmp_path, lambda s: fly(s) | {"map.bias_m": biases_m[s.sample]})
+    metric = next(metric for metric in analysis.metric_summaries if metric.name == "map.bias_m")
+    assert (
+        metric.bound.value == pytest.approx(np.percentile(-biases_m[analysis.complete], 95)) and metric.median.value < 0
+    )

@@ -258,12 +258,25 @@ def test_a_search_is_not_continued_with_an_edited_scenario_file(tmp_path):
         search(study, tmp_path / "out", resume=True)
 
 
+def test_a_search_is_not_continued_if_a_file_of_another_sample_has_changed(tmp_path):
+    for name, value in (("a", 0.1), ("b", 0.2)):
+        (tmp_path / f"{name}.csv").write_text(f"time_s,height_m,east_mps,north_mps\n0,0,{value},0\n")
+    files = f'current.file = {{ grid = ["{tmp_path / "a.csv"}", "{tmp_path / "b.csv"}"] }}\n'
+    study = study_of(tmp_path, TUNING, ("[vary]\n", f"[vary]\n{files}"))
+    assert search(study, tmp_path / "out", SerialEngine(stop_before=15)).interrupted
+    (tmp_path / "b.csv").write_text("time_s,height_m,east_mps,north_mps\n0,0,0.25,0\n")
+    with pytest.raises(TwinError, match=r"--resume: the file .*b\.csv has changed"):
+        search(study, tmp_path / "out", resume=True)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("[1.5, 3.0]", "[-1.5, 3.0]", "17: tune.search.plan.altitude_m: -1.5: not allowed"),
         ("uniform = [1.5, 3.0]", "normal = [2.0, 0.1]", "17: tune.search.plan.altitude_m: normal cannot be searched"),
         ('"risk"]', '"luck"]', "12: tune.objectives: luck: no such metric"),
+        ('"risk"]', '"map.bias_m"]', "12: tune.objectives: map.bias_m can be negative"),
+        ("plan.altitude_m = { uniform = [1.5, 3.0]", "plan.tracks = { uniform = [2, 6]", "17: tune.search.plan.tracks: "),
         (
             "plan.altitude_m =",
             "water.turbidity =",

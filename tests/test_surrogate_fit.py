@@ -250,6 +250,14 @@ def test_a_survey_in_water_without_matches_is_not_flown(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_saved_file_of_another_kind_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr(rendered_surveys, "_flown", lambda *_: SurveyStatistics({"noise": [1.0]}, {}))
+    scenario = load_scenario("reef", ["plan.tracks=1"])
+    for text in ("[]", "3", "not JSON"):
+        (tmp_path / "surrogate_comparison.json").write_text(text)
+        assert rendered_surveys.survey_statistics(scenario, tmp_path, MODEL).samples == {"noise": [1.0]}
+
+
 @pytest.mark.parametrize(("lost_px", "limit_px"), [(0.3, np.inf), (0.05, 0.1)])
 def test_the_bound_is_unlimited_if_the_most_turbid_survey_of_the_fit_was_lost(lost_px, limit_px):
     complete, lost = (SurveyStatistics({"condition_bound_px": [px, px]}, {}) for px in (0.1, lost_px))

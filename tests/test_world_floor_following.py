@@ -152,3 +152,10 @@ def test_a_vehicle_follows_a_floor_that_nobody_knew(height, largest_m, tmp_path)
 def test_a_chart_that_cannot_be_used_is_refused(overrides, line):
     with pytest.raises(ScenarioError, match=line.replace("(", r"\(")):
         prepare(scenario(*overrides))
+
+
+def test_noisy_readings_of_an_altimeter_lie_in_its_range():
+    floor = height_field(np.zeros((3, 3)), 10.0, -10.0, -10.0)
+    altimeter = Altimeter(scenario("navigation.altimeter_sigma=0.5").navigation, floor, np.random.default_rng(0))
+    found = [altimeter.read(level_pose(0, 0, 2.0)) for _ in range(500)]
+    assert all(reading is None or 0.3 <= reading <= 50.0 for reading in found) and 0 < found.count(None) < 100

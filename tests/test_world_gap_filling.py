@@ -81,3 +81,11 @@ def test_tasks_have_their_own_maps_in_the_order_of_flight(tmp_path):
     assert found["overlap"]["across_asked"] == plain["overlap"]["across_asked"]
     assert found["overlap"]["across_median"] == pytest.approx(plain["overlap"]["across_median"], abs=0.02)
     assert found["map"]["cell_m"] == plain["map"]["cell_m"] and plain["tasks"] == []
+
+
+@pytest.mark.parametrize("across_m", [0.15, 0.6, 1.3])
+def test_without_a_keyframe_the_whole_area_is_a_gap(across_m):
+    mission = prepare(scenario(f"plan.area_m=[4.0,{across_m}]"))
+    filler = GapFiller(mission)
+    assert filler.path(mission.plan.reference(1, 0.0), (0.0, 0.0, 2.0))
+    assert filler.gaps.found_m2 == pytest.approx(4.0 * across_m)

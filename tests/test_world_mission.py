@@ -121,6 +121,20 @@ FLAT = ["terrain.kind=flat", "terrain.relief_m=0", "terrain.size_m=[40,40]", "ob
             "waves.period_s: is unused: it follows from waves.wind_mps",
         ),
         (["vehicle.dynamics=kinematic", "current.gust_vertical_mps=0.2"], "current.gust_vertical_mps: has no effect"),
+        (["vehicle.thrust_coefficients=[0.1]"], "vehicle.buoyancy_n: the thrusters cannot hold the depth"),
+        (["vehicle.buoyancy_n=20", "vehicle.thrust_coefficients=[4]"], "vehicle.buoyancy_n: the thrusters cannot hold"),
+        (["navigation.dvl_range_m=[50,0.3]", 'navigation.aiding=["dvl"]'], "navigation.dvl_range_m: .*: no range"),
+        (["navigation.altimeter_range_m=[9,0.3]"], r"navigation.altimeter_range_m: \[9, 0.3\]: no range"),
+        (
+            ["plan.pattern=loops", "plan.area_m=[16,16]", "plan.altitude_m=3",
+             'tasks=[{name="t",within_leg=true,position_m=[0,0],size_m=[1,1],altitude_m=2}]'],
+            "tasks.0.within_leg: has no effect on arcs",
+        ),
+        (
+            ['tasks=[{name="t",position_m=[0,0],size_m=[3,2],altitude_m=1.2,overlap_across=0.995,speed_mps=0.011}]',
+             "plan.area_m=[4,3]", "plan.altitude_m=2"],
+            r"plan.area_m: [\d.e+]+ frames",
+        ),
     ],
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused(overrides, error):
@@ -143,3 +157,18 @@ def test_a_path_that_meets_a_steep_floor_between_its_corners_is_planned_or_refus
 def test_a_vehicle_without_drag_is_limited_by_no_speed():
     drag = [f"vehicle.{kind}_drag=[0,0,0,0,0,0]" for kind in ("linear", "quadratic")]
     assert prepare(load_scenario("reef", [*FLAT, *drag, "plan.area_m=[4,2]", "plan.tracks=1"])).n_frames > 0
+
+
+def test_the_frames_of_a_sequence_that_ends_early_take_no_memory_of_the_rest():
+    mission = prepare(load_scenario("reef", FLAT))
+    whole = mission.planned_frames(1)
+    first = whole.first(3)
+    parts = *first.reference, first.keyframe, first.path_times_s
+    assert all(part.base is None or part.base.nbytes <= part.nbytes for part in parts) and len(first) == 3
+    assert np.array_equal(first.reference.position, whole.reference.position[:3])
+
+
+def test_a_map_of_a_low_task_has_cells():
+    tasks = 'tasks=[{name="t",position_m=[0,0],size_m=[0.02,0.02],altitude_m=0.05}]'
+    far = ["plan.area_m=[4,3]", "plan.altitude_m=40", "plan.clearance_m=0", "map.cell_m=0.03", tasks]
+    assert prepare(load_scenario("reef", [*FLAT, *far])).details[0].grid.cell_m >= 1e-5

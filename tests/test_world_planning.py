@@ -17,6 +17,7 @@ from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.simulate.sea import make_sea
 from twin.terrains import Terrain, TextureSource
+from twin.world.energy import planned_energy
 from twin.world.floor_forecast import forecast_over_floor, planned_overlap, spread
 from twin.world.mission import prepare
 from twin.world.path_checks import check_thrust, climb_slope
@@ -296,3 +297,17 @@ def test_the_time_at_the_start_of_each_track_counts_in_the_size_of_a_plan():
     check_plan_size(plan_survey(scenario("plan.tracks=1"), None), hold_s)
     with pytest.raises(TwinError, match="frames"):
         check_plan_size(plan_survey(scenario("plan.tracks=2"), None), hold_s)
+
+
+def test_the_energy_of_a_plan_is_that_in_the_current_at_each_time(tmp_path):
+    """A current that runs for half of the time takes the mean of the energies without it and with it."""
+    file, keys = tmp_path / "current.csv", ("vehicle.dynamics=rigid", "imaging.fidelity=surrogate")
+    still, always = (planned_energy(prepare(scenario(*keys, f"current.velocity_mps=[{v},0,0]"))) for v in (0.0, 0.25))
+    mission = prepare(scenario(*keys))
+    half_s = mission.n_frames / mission.rig.frame_rate_hz / 2
+    rows = [(0, 0), (half_s - 0.05, 0), (half_s + 0.05, 0.25), (9999, 0.25)]
+    lines = [f"{t},{z},{east},0" for t, east in rows for z in (0, 9)]
+    file.write_text("time_s,height_m,east_mps,north_mps\n" + "\n".join(lines))
+    found = planned_energy(prepare(scenario(*keys, f"current.file={file}")))
+    assert still.survey_wh < always.survey_wh
+    assert found.survey_wh == pytest.approx((still.survey_wh + always.survey_wh) / 2, rel=0.15)

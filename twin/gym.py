@@ -263,6 +263,8 @@ class SeabedTwinStateEnv(_SurveyEnv):
             raise TwinError("observe", f"{unknown[0]!r}: no such observation", ", ".join(_BOUNDS))
         if frames < 1:
             raise TwinError("frames", f"{frames}", "1 or more")
+        if not callable(reward) and reward != "track":
+            raise TwinError("reward", f"{reward!r}: no such reward", '"track", or a function of the environment')
         super().__init__(given, action)
         self._reward, self._frames = reward, frames
         self._limits = {name: np.array(_BOUNDS[name], np.float64) for name in observe}
@@ -289,7 +291,7 @@ class SeabedTwinStateEnv(_SurveyEnv):
 
     def _observation(self) -> Observation:
         pose, reference = self.world.true_pose, self.world.reference
-        readings, available = _readings(self._frame) if "readings" in self._limits else (np.zeros(7), np.zeros(3))
+        readings, available = _readings(self._frame)
         values = {
             "pose": np.append(pose[:3, 3], geometry.quaternion_xyzw(pose[:3, :3])),
             "velocity": self.world.world.vehicle.twist_body,

@@ -156,9 +156,12 @@ def _view(contents: RunContents, number: int, image: CopiedImage, points: Array)
 def _observed(points_m: Array, camera: RecordedCamera) -> tuple[Array, NDArray[np.int64]]:
     """Returns the pixels (m, 2) and the indices (m,) of the points (n, 3) in camera axes that a camera observes."""
     assert camera.size_px is not None
-    ahead = points_m[:, 2] > 1e-3
+    width, height = camera.size_px
+    # far outside the field, the polynomial of a distortion folds back into the image
+    across = np.array([width, height]) / np.diag(camera.matrix)[:2]
+    ahead = (points_m[:, 2] > 1e-3) & (np.abs(points_m[:, :2]) < across * points_m[:, 2:]).all(axis=1)
     pixels = camera.project(np.where(ahead[:, None], points_m, 1.0))
-    (width, height), column_row = camera.size_px, np.floor(pixels + 0.5)
+    column_row = np.floor(pixels + 0.5)
     inside = ahead & (column_row >= 0).all(axis=1) & (column_row < [width, height]).all(axis=1)
     numbers = np.flatnonzero(inside)
     cell = (column_row[numbers, 1] * width + column_row[numbers, 0]).astype(np.int64)

@@ -19,7 +19,8 @@ from twin.errors import TwinError
 #: Largest time between the two images of a stereo pair: as a fraction of the median interval between left images, and
 #: absolute [s].
 _PAIR_SHARE, _PAIR_MOST_S = 0.25, 0.01
-_LATEST_S, _SHORTEST_S = 1e11, 1e-5  # latest time, and shortest median interval of the frames of a data set [s]
+#: latest time, and shortest and longest median interval of the frames of a data set [s]
+_LATEST_S, _SHORTEST_S, _LONGEST_S = 1e11, 1e-5, 1e5
 _UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1
 T = TypeVar("T")
 
@@ -82,7 +83,7 @@ class Reader(Protocol):
 
 
 def check_times(dataset: Dataset) -> None:
-    """Raises TwinError unless times are below 1e11 s, and the median of the differing intervals is above 1e-5 s."""
+    """Raises TwinError unless times are below 1e11 s, and the median of differing intervals is 1e-5 to 1e5 s."""
     times_s = np.array([frame.time_s for frame in dataset.images], np.float64)
     wrong = np.flatnonzero(~(np.abs(times_s) <= _LATEST_S))
     if len(wrong):
@@ -90,9 +91,9 @@ def check_times(dataset: Dataset) -> None:
         raise TwinError(str(dataset.folder), problem, f"seconds, up to {_LATEST_S:g}")
     intervals = np.abs(np.diff(times_s))
     intervals = intervals[intervals > 0]
-    if len(intervals) and (interval_s := float(np.median(intervals))) < _SHORTEST_S:
+    if len(intervals) and not _SHORTEST_S <= (interval_s := float(np.median(intervals))) <= _LONGEST_S:
         problem = f"the median interval between its frames is {interval_s:g} s"
-        raise TwinError(str(dataset.folder), problem, f"times in seconds, at least {_SHORTEST_S:g} s apart")
+        raise TwinError(str(dataset.folder), problem, f"times in seconds, {_SHORTEST_S:g} to {_LONGEST_S:g} s apart")
 
 
 def value_or_error(read: Callable[[], T]) -> T | TwinError:
@@ -129,6 +130,7 @@ def pair_by_time(left: Sequence[ImageTime], right: Sequence[ImageTime]) -> tuple
     order = np.argsort(right_s, kind="stable")
     nearest = order[nearest_index(right_s[order], left_s)]
     intervals = np.abs(np.diff(left_s))
+    intervals = intervals[intervals > 0]
     limit_s = min(_PAIR_MOST_S, _PAIR_SHARE * float(np.median(intervals)) if len(intervals) else _PAIR_MOST_S)
     gaps_s = np.abs(right_s[nearest] - left_s)
     paired = gaps_s <= limit_s

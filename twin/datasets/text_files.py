@@ -28,6 +28,12 @@ class _CalibrationLoader(yaml.SafeLoader):
             raise yaml.YAMLError(f"it has more than {_MOST_VALUES} values, or a value that contains itself")
         return super().construct_document(node)
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for name in [name for k, name in enumerate(names) if name in names[:k]]:
+            raise yaml.YAMLError(f"{name[:50]!r} is given twice")
+        return super().construct_mapping(node, deep)
+
 
 def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
     """Returns the number of values in a node, aliases expanded, given `known` ones by `id`; infinite if recursive."""

@@ -68,10 +68,11 @@ def _at_frames(given: Trajectory, rate_hz: float) -> Trajectory:
 def _check_clearance(path: Trajectory, mission: Mission) -> None:
     x, y, z = path.positions.T
     above_m = z - mission.terrain.height_at(x, y)
-    low = np.flatnonzero(above_m < _LEAST_CLEARANCE_M)
+    low = np.flatnonzero(~(above_m >= _LEAST_CLEARANCE_M))
     if len(low):
         k = int(low[0])
-        problem = f"the camera is {above_m[k]:.2f} m above the floor at {path.times_s[k]:.2f} s"
+        place = "not over the terrain" if np.isnan(above_m[k]) else f"{above_m[k]:.2f} m above the floor"
+        problem = f"the camera is {place} at {path.times_s[k]:.2f} s"
         raise TwinError(_OPTION, problem, f"at least {_LEAST_CLEARANCE_M:g} m")
 
 

@@ -263,7 +263,8 @@ def _interpolated(series: SensorSeries | None, time_s: float) -> Array | None:
     k = int(np.clip(np.searchsorted(series.times_s, time_s), min(1, last), last))
     before = max(k - 1, 0)
     gap_s = float(series.times_s[k] - series.times_s[before])
-    if gap_s > _MOST_GAP * _interval_s(series):
+    away_s = np.abs(series.times_s[[before, k]] - time_s).min()
+    if gap_s > _MOST_GAP * _interval_s(series) and away_s > 1e-6:
         return None
     share = (time_s - series.times_s[before]) / gap_s if gap_s > 0 else 0.0
     return series.values[before] + share * (series.values[k] - series.values[before])

@@ -57,7 +57,8 @@ def _csv_rows(file: Path) -> Array:
     if missing := [name for name in _COLUMNS if name not in names]:
         raise TwinError(KEY, f"{file.name!r} has no column {missing[0]}", _WANTED)
     with reading(file, KEY, _WANTED):
-        columns = {name: np.asarray(table.column(k), np.float64) for k, name in enumerate(names)}
+        wanted = {name: table.column(k) for k, name in enumerate(names) if name in (*_COLUMNS, "up_mps")}
+        columns = {name: np.asarray(column, np.float64) for name, column in wanted.items()}
     used = np.column_stack([columns[name] for name in _COLUMNS] + [columns.get("up_mps", np.zeros(table.num_rows))])
     for row in np.flatnonzero(~np.isfinite(used).all(axis=1)):
         raise TwinError(KEY, f"{file.name!r}: no number in row {row + 2}", "numbers in all rows")

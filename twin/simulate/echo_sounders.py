@@ -19,10 +19,9 @@ class Altimeter:
         """Returns the distance to the floor [m]; None outside the range of the sensor."""
         number = float(self._rng.standard_normal())
         distance_m = nearest_echo_m(self.floor, world_from_camera, self._settings.altimeter_beam_deg)
+        distance_m *= 1 + self._settings.altimeter_sigma * number
         nearest_m, farthest_m = self._settings.altimeter_range_m
-        if not nearest_m <= distance_m <= farthest_m:
-            return None
-        return distance_m * (1 + self._settings.altimeter_sigma * number)
+        return distance_m if nearest_m <= distance_m <= farthest_m else None
 
 
 class BottomLock:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.records import Image, Readings, StereoRig
 from twin.scenario.model import FaultConfig
+from twin.simulate.sea import GUST_RISE_S
 from twin.simulate.tether import Tether
 
 _READING_OF = {"pressure": "pressure_z_m", "ahrs": "ahrs_rpy_rad", "dvl": "dvl_mps", "usbl": "usbl_m"}
@@ -103,7 +104,7 @@ class Faults:
         """Lets gusts begin and end; `port` (3,) is the direction to port of the vehicle."""
         for row, fault in zip(single_gusts, self._gusts, strict=True):
             if any(fault is one for one in self._active):
-                if row[0] > self._time_s or row[1] <= self._time_s:
+                if row[0] > self._time_s or row[1] + GUST_RISE_S <= self._time_s:  # after the fall of the last one
                     to_port, given_deg = np.arctan2(port[1], port[0]), fault.direction_deg
                     angle = to_port if given_deg is None else np.deg2rad(given_deg)
                     row[:] = self._time_s, np.inf, fault.size * np.cos(angle), fault.size * np.sin(angle), 0.0

@@ -21,7 +21,7 @@ _PROFILE_M = np.geomspace(0.01, 500.0, 200)
 GUST_INTERVAL_S = 0.1  #: time between the values of a series [s]
 _REPEAT = 60  # the series repeats after this multiple of the correlation time, or after an hour if that is longer
 _HOUR_S = 3600.0
-_RISE_S = 1.0  # in which a single gust rises, and falls
+GUST_RISE_S = 1.0  # in which a single gust rises, and falls
 _VERTICAL = 0.5  # default ratio of the standard deviations, vertical to horizontal: about 1.2 u* to 2.3 u*
 
 
@@ -73,9 +73,10 @@ def _mean(current: CurrentConfig, depth_m: float) -> tuple[Array, Array, Array]:
     return np.zeros(1), _PROFILE_M, (factor[:, None] * velocity)[None]
 
 
-def mean_current_mps(sea: Sea, height_m: float) -> Array:
-    """Returns the current (3,) at 0 s and a height, without gusts and waves."""
-    return flow_at(sea._replace(gusts_mps=np.zeros((0, 3)), waves=CALM), 0.0, np.array([0.0, 0.0, height_m]))[0].copy()
+def mean_current_mps(sea: Sea, height_m: float, time_s: float = 0.0) -> Array:
+    """Returns the current (3,) at a height and a time, without gusts and waves."""
+    calm, position = sea._replace(gusts_mps=np.zeros((0, 3)), waves=CALM), np.array([0.0, 0.0, height_m])
+    return flow_at(calm, time_s, position)[0].copy()
 
 
 def strongest_currents_mps(sea: Sea, lowest_m: float, highest_m: float) -> Array:
@@ -180,9 +181,9 @@ def add_single_gusts(gusts, time_s, flow):
         for sign, since_s in ((1.0, time_s - start_s), (-1.0, time_s - end_s)):
             if since_s <= 0.0:
                 continue
-            share = min(1.0, since_s / _RISE_S)
+            share = min(1.0, since_s / GUST_RISE_S)
             velocity = sign * share * share * (3 - 2 * share)
-            rate = sign * 6 * share * (1 - share) / _RISE_S
+            rate = sign * 6 * share * (1 - share) / GUST_RISE_S
             for i, mps in enumerate((east, north, up)):
                 flow[0, i] += velocity * mps
                 flow[1, i] += rate * mps

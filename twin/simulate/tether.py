@@ -41,12 +41,12 @@ NO_TETHER = tether_of(TetherConfig(), np.zeros(3))
 
 def steady_pulls(tether: Tether, current_mps: Array, position_m: Array, yaw: Array, velocity_mps: Array) -> Array:
     """Returns the wrenches (n, 6) [N m, N] of a tether on a level vehicle, in the body."""
-    # in a current (3,), at positions (n, 3), yaws (n,) [rad] and velocities (n, 3) in the world
-    wrenches, sea, zero = np.zeros((len(yaw), 6)), steady_current(current_mps), np.zeros(3)
+    # in a current (3,) or (n, 3), at positions (n, 3), yaws (n,) [rad] and velocities (n, 3) in the world
+    wrenches, currents, zero = np.zeros((len(yaw), 6)), np.broadcast_to(current_mps, (len(yaw), 3)), np.zeros(3)
     for k in range(len(yaw) if tether.length_m else 0):
         c, s, moving = np.cos(yaw[k]), np.sin(yaw[k]), np.concatenate([velocity_mps[k], zero])
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        add_tether(wrenches[k], tether, sea, 0.0, rotation, position_m[k], moving)
+        add_tether(wrenches[k], tether, steady_current(currents[k]), 0.0, rotation, position_m[k], moving)
     return wrenches
 
 

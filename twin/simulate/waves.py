@@ -68,7 +68,7 @@ def peak_radps(waves: WavesConfig) -> float:
     """Returns the angular frequency of the peak; with wind U and fetch F, 22 (g^2 / U F)^(1/3)."""
     if waves.wind_mps is None or waves.fetch_m is None:
         return 2 * math.pi / waves.period_s
-    return 22 * float(GRAVITY_MPS2**2 / (waves.wind_mps * waves.fetch_m)) ** (1 / 3)
+    return 22 * float(GRAVITY_MPS2**2 / (waves.wind_mps * _growing_m(waves.wind_mps, waves.fetch_m))) ** (1 / 3)
 
 
 def jonswap(waves: WavesConfig, omega: Array) -> Array:
@@ -88,7 +88,12 @@ def significant_height_m(waves: WavesConfig) -> float:
     # the fit of Hasselmann et al. (1973) to measured variances; their fit of alpha gives 1.27 times this height
     if waves.wind_mps is None or waves.fetch_m is None:
         return waves.height_m
-    return 0.0016 * waves.wind_mps * math.sqrt(waves.fetch_m / GRAVITY_MPS2)
+    return 0.0016 * waves.wind_mps * math.sqrt(_growing_m(waves.wind_mps, waves.fetch_m) / GRAVITY_MPS2)
+
+
+def _growing_m(wind_mps: float, fetch_m: float) -> float:
+    """Returns the fetch over which waves grow: up to g F / U^2 = 2.3e4 (Shore Protection Manual 1984) [m]."""
+    return min(fetch_m, 2.3e4 * wind_mps**2 / GRAVITY_MPS2)
 
 
 def _shape(waves: WavesConfig, omega: Array) -> Array:

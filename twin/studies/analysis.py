@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twin.core.records import Mask
 from twin.judge.map_error import with_completeness
-from twin.judge.verdict import more_is_better
+from twin.judge.verdict import SIGNED, more_is_better
 from twin.studies import statistics
 from twin.studies.answers import (
     Answer,
@@ -188,9 +188,10 @@ class StudyAnalysis:
         for name in self.metrics:
             included = self.included(name)
             data, clusters = self.numbers(name)[included], self.clusters[included]
+            extreme = 5.0 if more_is_better(name) else 95.0
             median, bound = (
-                statistics.bootstrap_with_unknown(data, lambda v, q=q: statistics.percentile(v, q), clusters, further)
-                for q in (50.0, 5.0 if more_is_better(name) else 95.0)
+                statistics.bootstrap_with_unknown(part, lambda v, q=q: statistics.percentile(v, q), clusters, further)
+                for part, q in ((data, 50.0), (np.abs(data) if name in SIGNED else data, extreme))
             )
             found.append(MetricSummary(name, len(data), median, bound, self.limits.get(name)))
         return found

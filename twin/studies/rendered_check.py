@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.judge.verdict import more_is_better
+from twin.judge.verdict import SIGNED, more_is_better
 from twin.studies import sentences
 from twin.studies.analysis import Mask, StudyAnalysis
 from twin.studies.flight import has_passed
@@ -116,6 +116,7 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
     is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
     chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
     values = {name: analysis.numbers(name)[chosen] for name in analysis.limits}
+    values = {name: np.abs(found) if name in SIGNED else found for name, found in values.items()}
     excess = [_excess(values[name], limit) * (1 - 2 * more_is_better(name)) for name, limit in analysis.limits.items()]
     finite = np.isfinite(list(values.values())).all(axis=0)
     distance = np.abs(np.max(excess, axis=0))[finite]

@@ -121,11 +121,11 @@ def _render_refused(study: Study, folder: Path, log: ResultsLog, fleet: Fleet, a
     """Flies rendered what only the surrogate refused, keeping scenario hashes; False if interrupted by Ctrl-C."""
     rows = {key_of(row): row for row in log.rows()}
     refused = {key: row["scenario_hash"] for key, row in rows.items() if row.get("unmodelled")}
-    if not refused:
-        return True
     samples_of = {sample for sample, _ in refused}
     others = {sample.number for sample in samples(study)} - samples_of
     chosen = [rendered(survey) for survey in surveys(study, folder, others, shuffled=True) if survey.key in refused]
+    if not chosen:
+        return True
     longest_s = max((row.get("timing.simulated_s") or 0.0 for row in rows.values()), default=0.0)
     survey_s, source = rendered_time(rows.values(), chosen[0].scenario, longest_s)
     time_told = f"about {duration(survey_s)} on one core each ({source}), {duration(survey_s * len(chosen))} in total"

@@ -268,6 +268,9 @@ def _goal_rules(study: Study) -> Iterator[Rule]:
     for name in study.compare:
         problem = f"{name} can be negative, but the ratio of its medians is compared"
         yield name in SIGNED, "compare", problem, "metrics that are never negative, such as map.rmse_m"
+    for name in study.tune.objectives if study.tune else ():
+        problem = f"{name} can be negative, and its least value is not the best one"
+        yield name in SIGNED, "tune.objectives", problem, "metrics that are never negative, such as map.rmse_m"
     has_both = fidelity is not None and {*map(repr, fidelity.grid or ())} == {*map(repr, FIDELITIES)}
     single, allowed = bool(study.compare) and not has_both, "vary.imaging.fidelity with a grid of both"
     yield single, "compare", "needs surveys of both fidelities", allowed

@@ -97,7 +97,7 @@ def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) ->
     identity = {"scenario_hash": scenario.fingerprint(), "model": repr(compared)}
     with suppress(TwinError):
         saved = read_json(folder / _FILE)
-        if saved | identity == saved:
+        if isinstance(saved, dict) and saved | identity == saved:
             return SurveyStatistics(*saved["statistics"])
     statistics = _flown(scenario, folder, compared)
     if statistics.samples:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from twin.errors import ScenarioError, TwinError
 from twin.judge.map_error import CAUSES, INFINITE_WITH_HOLES, with_completeness
 from twin.judge.verdict import meets_limit, more_is_better
-from twin.scenario.file import read_tree
+from twin.scenario.file import input_files, read_tree
 from twin.scenario.model import Scenario
 from twin.studies.analysis import count_similar
 from twin.studies.conditions import in_sea_trial
@@ -177,14 +177,26 @@ class CandidateSurveys:
 
     def check_bounds(self) -> None:
         """Raises ScenarioError unless the first valid sample is valid at both bounds, or all values, of each key."""
-        condition, errors = self.conditions[0], []
-        for key, value in ((key, value) for key, law in self.config.search.items() for value in law.values):
+        errors = []
+        for sample in self._bounds():
             try:
-                scenario_of_sample(self.study, self.base, condition._replace(values={key: value} | condition.values))
+                scenario_of_sample(self.study, self.base, sample)
             except ScenarioError as error:
                 errors += error.lines
         if errors:
             raise ScenarioError(merge_errors(errors))
+
+    def _bounds(self) -> Iterator[Sample]:
+        """Yields the first valid sample with the bounds, and a value between them, or all values of each key."""
+        sample = self.conditions[0]
+        for key, law in self.config.search.items():
+            for value in (*law.values, *law.quantiles(np.array([0.37]))):
+                yield sample._replace(values={key: value} | sample.values)
+
+    def input_files(self) -> Iterator[Path]:
+        """Yields the input files of all valid samples, and of the values of the search."""
+        for sample in (*self.conditions, *self._bounds()):
+            yield from input_files(scenario_of_sample(self.study, self.base, sample))
 
     def add(self, row: Row) -> None:
         self._scores[key_of(row)] = SurveyScore(

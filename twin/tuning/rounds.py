@@ -9,7 +9,6 @@ from typing import NamedTuple
 from twin.core.checkpoint import check_inputs
 from twin.planning.summary import instructions
 from twin.report.number_formats import duration, percent
-from twin.scenario.file import input_files
 from twin.scenario.model import Scenario
 from twin.studies.flight import Row
 from twin.studies.results_log import ResultsLog, key_of, write_parquet
@@ -94,7 +93,7 @@ def tune(study: Study, folder: Path, resume: bool, fleet: Fleet) -> TuningResult
     CandidateSurveys(study, folder, ()).check_bounds()
     with open_folder(folder, resume, search=True) as log:
         tuning, interrupted, out_of_time = Tuning(study, folder, fleet, log), False, False
-        check_inputs(folder, input_files(tuning.trials.original))
+        check_inputs(folder, tuning.trials.input_files())
         try:
             tuning.run()
         except KeyboardInterrupt:

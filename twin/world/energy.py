@@ -1,4 +1,4 @@
-"""Energy of a survey, planned or flown, from the velocities through the mean current."""
+"""Energy of a survey, planned or flown, from the velocities through the current without gusts and waves."""
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from twin.world.mission import Mission
 from twin.world.path_checks import body_velocities
 
 _INTERVAL_S = 0.5  # between the velocities of a flown path
+_CURRENTS = 500  # along a path, between which the current is interpolated
 
 
 def planned_motion(mission: Mission) -> tuple[Array, Array]:
@@ -24,7 +25,8 @@ def planned_motion(mission: Mission) -> tuple[Array, Array]:
     n_hold = mission.n_frames - len(flown.position)
     velocities = np.vstack([flown.velocity, np.zeros((n_hold, 3))])
     yaw = np.pad(np.asarray(flown.yaw), (0, n_hold), "edge")
-    return _in_current(mission, np.pad(flown.position, ((0, n_hold), (0, 0)), "edge"), yaw, velocities)
+    times_s = np.arange(len(yaw)) / mission.rig.frame_rate_hz
+    return _in_current(mission, times_s, np.pad(flown.position, ((0, n_hold), (0, 0)), "edge"), yaw, velocities)
 
 
 def planned_energy(mission: Mission) -> Energy:
@@ -40,11 +42,15 @@ def flown_energy(mission: Mission, path: Trajectory) -> Energy:
         return Energy()
     yaw = geometry.heading_of_camera(path.world_from_camera[::n][:-1])
     velocities = np.diff(positions, axis=0) / np.diff(times_s)[:, None]
-    through_water, pulls = _in_current(mission, positions, yaw, velocities)
+    through_water, pulls = _in_current(mission, times_s[:-1], positions[:-1], yaw, velocities)
     return energy_of(vehicle, through_water, float(times_s[1] - times_s[0]), pulls)
 
 
-def _in_current(mission: Mission, positions: Array, yaw: Array, velocities: Array) -> tuple[Array, Array]:
-    current = mean_current_mps(make_sea(mission.scenario), float(positions[:, 2].mean()))
+def _in_current(
+    mission: Mission, times_s: Array, positions: Array, yaw: Array, velocities: Array
+) -> tuple[Array, Array]:  # fmt: skip
+    sea, rows = make_sea(mission.scenario), np.unique(np.linspace(0, len(times_s) - 1, _CURRENTS).astype(int))
+    known = np.array([mean_current_mps(sea, float(positions[k, 2]), float(times_s[k])) for k in rows])
+    current = np.column_stack([np.interp(times_s, times_s[rows], column) for column in known.T])
     tether = tether_of(mission.scenario.tether, mission.start[:3, 3])
     return body_velocities(yaw, velocities - current), steady_pulls(tether, current, positions, yaw, velocities)

@@ -22,8 +22,8 @@ class GapFiller:
     def __init__(self, mission: Mission):
         plan, chart = mission.plan, mission.chart
         self._plan, self._chart, self._area = plan, chart, plan.area
-        self._cell_m = min(plan.request.footprint_m) / _CELLS
-        self._shape = [int(np.ceil(side / self._cell_m)) for side in self._extent_m]
+        self._shape = [int(np.ceil(side * _CELLS / min(plan.request.footprint_m))) for side in self._extent_m]
+        self._cell_m = np.array(self._extent_m) / self._shape
         self._n = np.zeros(self._shape, np.int64)
         x, y = self._area.to_scene(*np.meshgrid(*self._centres(), indexing="ij"))
         self._asked = plan.inside_area(x, y) & ~chart.in_hole(x, y)
@@ -32,7 +32,7 @@ class GapFiller:
     def add(self, points_m: Array) -> None:
         """Adds the stereo points (n, 3) of a keyframe in the world [m]."""
         in_legs = np.stack(self._area.to_legs(points_m[:, 0], points_m[:, 1]))
-        cell = np.floor((in_legs + np.array(self._extent_m)[:, None] / 2) / self._cell_m).astype(np.int64)
+        cell = np.floor((in_legs + np.array(self._extent_m)[:, None] / 2) / self._cell_m[:, None]).astype(np.int64)
         inside = ((cell >= 0) & (cell < np.array(self._shape)[:, None])).all(axis=0)
         shown = np.zeros(self._shape, np.bool_)
         shown[tuple(cell[:, inside])] = True
@@ -41,7 +41,7 @@ class GapFiller:
     def path(self, last: Reference, end: Point) -> tuple[Segment, ...]:
         """Returns legs over the gaps, from the end of the planned path, where the reference is `last`; () for none."""
         gap = self._asked & (self._n < _LEAST_KEYFRAMES)
-        left_m2, before_m2 = float(gap.sum()) * self._cell_m**2, self.gaps.left_m2
+        left_m2, before_m2 = float(gap.sum() * self._cell_m.prod()), self.gaps.left_m2
         self.gaps = Gaps(left_m2 if self.gaps.found_m2 is None else self.gaps.found_m2, left_m2)
         in_vain = before_m2 is not None and left_m2 >= before_m2
         if not gap.any() or in_vain or self._n_tracks == _MOST_TRACKS:
@@ -55,13 +55,13 @@ class GapFiller:
         return (along_m, along_m) if self._area.shape == "disc" else (along_m, across_m)
 
     def _centres(self) -> list[Array]:
-        sides = zip(self._shape, self._extent_m, strict=True)
-        return [(np.arange(n, dtype=np.float64) + 0.5) * self._cell_m - side_m / 2 for n, side_m in sides]
+        sides = zip(self._shape, self._cell_m, strict=True)
+        return [(np.arange(n, dtype=np.float64) + 0.5 - n / 2) * side_m for n, side_m in sides]
 
     def _legs(self, gap: NDArray[np.bool_]) -> list[tuple[Point, Point]]:
         """Returns legs along u over the gaps: one for each run of them in strips as wide as the spacing of the legs."""
         u, v = self._centres()
-        n = max(1, int(self._plan.swath_spacing_m / self._cell_m))
+        n = max(1, int(self._plan.swath_spacing_m / self._cell_m[1]))
         margin_m, found = self._plan.side_along_m / 4, list[tuple[Point, Point]]()
         for first in np.unique(np.nonzero(gap)[1] // n) * n:
             strip = gap[:, first : first + n]

@@ -86,8 +86,10 @@ class FrameSequence:
         return len(self.keyframe)
 
     def first(self, n: int) -> FrameSequence:
-        reference = segments.Reference(*(np.asarray(part)[:n] for part in self.reference))
-        return replace(self, reference=reference, keyframe=self.keyframe[:n], path_times_s=self.path_times_s[:n])
+        # copies: views would keep all frames
+        reference = segments.Reference(*(np.asarray(part)[:n].copy() for part in self.reference))
+        keyframe, path_times_s = self.keyframe[:n].copy(), self.path_times_s[:n].copy()
+        return replace(self, reference=reference, keyframe=keyframe, path_times_s=path_times_s)
 
     def __getitem__(self, k: int) -> Step:
         return Step(self.reference.row(k), bool(self.keyframe[k]), self.holding)
@@ -158,7 +160,7 @@ class Mission:
     def _detail(self, task: TaskConfig, track: int) -> Detail:
         area = SurveyArea("rectangle", task.size_m, task.position_m, self.plan.area.heading)
         ratio = min(1.0, task.altitude_m / self.plan.request.altitude_m)
-        cell_m = round(self.scenario.map.cell_m * ratio, 4) if task.cell_m is None else task.cell_m
+        cell_m = max(round(self.scenario.map.cell_m * ratio, 4), 1e-4) if task.cell_m is None else task.cell_m
         (west, south), (east, north) = (f(area.outline(), axis=0) for f in (np.min, np.max))
         n = np.ceil(np.array([north - south, east - west]) / cell_m - 1e-9).astype(int).tolist()
         return Detail(task.name, track, MapGrid(float(west), float(north), cell_m, *n), area)
@@ -204,7 +206,9 @@ class Mission:
         times_s = pace.path_times(path_time_s, float(planned_s[-1]), 1 / self.plan.request.frame_rate_hz)
         reference = pace.scaled(self.plan.references(track, times_s))
         passed = np.searchsorted(planned_s[planned_keyframes], np.append(path_time_s, times_s) + SAME_TIME_S, "right")
-        return FrameSequence(reference, (np.diff(passed) > 0) | pace.keyframe, False, times_s, track, pace.rate)
+        keyframes = np.diff(passed) > 0
+        keyframes[:1] |= pace.keyframe
+        return FrameSequence(reference, keyframes, False, times_s, track, pace.rate)
 
     @property
     def _n_holding(self) -> int:

@@ -18,12 +18,12 @@ class Pace(NamedTuple):
     keyframe: bool = False  #: whether the next frame is a keyframe in addition to the planned ones
 
     def path_times(self, last_s: float, end_s: float, interval_s: float) -> Array:
-        """Returns the path times (n,) of the next frames [s]: one or, at full pace, all to the last, `end_s`.
+        """Returns the path times (n,) of the next frames [s]: one or, at the planned speed, all to the last, `end_s`.
 
         Empty if the frame at `last_s`, the last one flown, is the last of the track.
         """
         n_full = int(np.ceil((end_s - last_s - SAME_TIME_S) / interval_s))
-        n = min(n_full, 1) if self != FULL else n_full
+        n = n_full if self.rate == 1 and not self.change_per_s else min(n_full, 1)
         return np.minimum(last_s + self.rate * interval_s * np.arange(1, n + 1), end_s)
 
     def scaled(self, reference: Reference) -> Reference:

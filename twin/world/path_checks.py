@@ -297,6 +297,8 @@ def _check_thrust_in(
 ) -> None:
     """Raises TwinError if the thrust load(current, velocities) is above 1 to hold station or at velocities (n, 3)."""
     speed_mps = float(np.linalg.norm(current))
+    if load(0 * current, 0 * velocity) >= 1:
+        raise TwinError("vehicle.buoyancy_n", f"the thrusters cannot hold the depth{tether}", "less, or more thrust")
     if (factor := _saturating_factor(lambda k: load(k * current, 0 * velocity))) is not None:
         raise TwinError(
             "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it{tether}",

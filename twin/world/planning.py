@@ -64,8 +64,9 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     x, y, z = plan.all_references().position.T
     if scenario.plan.overlap_reference == "floor" and not (terrain.height_at(x, y) >= z).any():
         plan = _over_floor(plan, pattern, terrain, scenario.believed_rig())
-        check_plan_size(plan, scenario.control.hold_s)
-    return _with_tasks(scenario, plan, terrain)
+    plan = _with_tasks(scenario, plan, terrain)
+    check_plan_size(plan, scenario.control.hold_s)
+    return plan
 
 
 def _with_tasks(scenario: Scenario, plan: SurveyPlan, terrain: Terrain) -> SurveyPlan:

@@ -42,6 +42,10 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
         yield TwinError("navigation.aiding", "'imu': the scenario has no IMU", "with an [imu] section")
     if "imu" in scenario.navigation.aiding and scenario.imaging.fidelity != "rendered":
         yield TwinError("navigation.aiding", "'imu': the surrogate has no IMU", 'imaging.fidelity = "rendered"')
+    for key in ("dvl_range_m", "altimeter_range_m"):
+        nearest_m, farthest_m = getattr(scenario.navigation, key) or (0.0, 1.0)
+        if nearest_m >= farthest_m:
+            yield TwinError(f"navigation.{key}", f"[{nearest_m:g}, {farthest_m:g}]: no range", "the nearest one first")
     if scenario.sensor is not None:
         yield from _of_sensor(scenario.sensor, scenario.rig.frame_rate_hz)
     yield from _of_lens(scenario)
@@ -131,6 +135,8 @@ def _of_tasks(scenario: Scenario) -> Iterator[TwinError]:
             yield TwinError(f"tasks.{k}.start_s", "contradicts after_track", "one of the two")
         if task.within_leg and task.after_track is not None:
             yield TwinError(f"tasks.{k}.within_leg", "contradicts after_track", "one of the two")
+        if task.within_leg and scenario.plan.pattern == "loops":
+            yield TwinError(f"tasks.{k}.within_leg", "has no effect on arcs", 'false, or plan.pattern = "lawnmower"')
         if scenario.vehicle.dynamics == "kinematic":
             problem, allowed = "a kinematic vehicle moves in a horizontal plane", 'vehicle.dynamics = "rigid"'
             yield TwinError(f"tasks.{k}.altitude_m", problem, allowed)

@@ -129,7 +129,8 @@ class World(ABC):
 
     def start_sequence(self, sequence: FrameSequence) -> None:
         """Starts the next planned frames of a track, after all frames of the last sequence (or `end_sequence`)."""
-        self._sequences.append(sequence)
+        kept = sequence.reference._replace(velocity=np.zeros((0, 3)), acceleration=np.zeros((0, 3)))
+        self._sequences.append(replace(sequence, reference=kept))  # what the truth needs
 
     def end_sequence(self, n: int) -> None:
         self._sequences[-1] = self._sequences[-1].first(n)
