@@ -1,6 +1,6 @@
 """Late and rare readings: fused at their time, given to the next node, and bridged by vision."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_a_late_reading_has_the_effect_that_it_would_have_had_in_time(sensor):
     in_time, _ = flown(9, at=3, readings=readings)
     late, log = flown(9)
     kept = late.fuse_earlier(readings, *motion_since(log, 0.3))
-    assert all(getattr(kept, name) is value for name, value in vars(readings).items())
+    assert all(getattr(kept, part.name) is getattr(readings, part.name) for part in fields(readings))
     assert late.gates.counts[:, 1].sum() == 0
     # the linearisation differs by the correction: up to 0.3 m or 0.01 rad, times rotations of the path of 0.1 rad
     np.testing.assert_allclose(late.world_from_camera, in_time.world_from_camera, atol=1e-7)

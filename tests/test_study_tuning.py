@@ -276,7 +276,11 @@ def test_a_search_is_not_continued_if_a_file_of_another_sample_has_changed(tmp_p
         ("uniform = [1.5, 3.0]", "normal = [2.0, 0.1]", "17: tune.search.plan.altitude_m: normal cannot be searched"),
         ('"risk"]', '"luck"]', "12: tune.objectives: luck: no such metric"),
         ('"risk"]', '"map.bias_m"]', "12: tune.objectives: map.bias_m can be negative"),
-        ("plan.altitude_m = { uniform = [1.5, 3.0]", "plan.tracks = { uniform = [2, 6]", "17: tune.search.plan.tracks: "),
+        (
+            "plan.altitude_m = { uniform = [1.5, 3.0]",
+            "plan.tracks = { uniform = [2, 6]",
+            "17: tune.search.plan.tracks: ",
+        ),
         (
             "plan.altitude_m =",
             "water.turbidity =",

@@ -185,7 +185,7 @@ class ImuReadings(NamedTuple):
         return ImuReadings(np.append(self.times_s, time_s), *(np.vstack([part, part[-1:]]) for part in self[1:]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Readings:
     """Readings of the navigation sensors at a frame; None for a sensor that is not used or has no new reading."""
 

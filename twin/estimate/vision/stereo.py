@@ -42,7 +42,7 @@ class StereoPoints(NamedTuple):
         return StereoPoints._make([*(column[keep] for column in columns), noise_ratio])
 
 
-@dataclass
+@dataclass(slots=True)
 class Keyframe:
     """Frame with a stereo pair whose pose the network estimates ("key point" in the paper); updated in place."""
 
