@@ -66,6 +66,15 @@ def test_a_lamp_below_the_floor_is_accepted_at_the_allowed_height():
     prepare(load_scenario("reef", [*SMALL, f"lamps.0.position_m=[0.25, 0.35, {height_m + 0.01}]"]))
 
 
+def test_a_lamp_below_the_floor_of_a_task_is_refused():
+    low = 'tasks=[{name="t",position_m=[0,0],size_m=[0.4,0.4],altitude_m=1.5}]'
+    lamp = "lamps.0.position_m=[0.25, 0.35, -1.7]"
+    flat = ["terrain.kind=flat", "plan.clearance_m=0.1"]
+    prepare(load_scenario("reef", [*SMALL, *flat, lamp]))
+    with pytest.raises(ScenarioError, match=r"lamps\.0\.position_m: is 0\.\d\d m below the floor"):
+        prepare(load_scenario("reef", [*SMALL, *flat, lamp, low]))
+
+
 def test_water_lamps_and_sun_survive_a_round_trip_with_a_relative_spectrum_file(tmp_path):
     (tmp_path / "lake.csv").write_text("400, 0.1, 0.2\n700, 0.3, 0.2\n")
     file = tmp_path / "lake.toml"

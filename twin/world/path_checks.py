@@ -10,7 +10,6 @@ from scipy.optimize import root_scalar
 
 from twin.controllers.forecast import Clearance, least_clearance
 from twin.controllers.survey_plan import SurveyPlan
-from twin.controllers.tracking import rotate_lever_arm
 from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import FaultConfig, PlanConfig, Scenario, VehicleConfig
@@ -23,9 +22,6 @@ from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.objects.scattering import disc_of
 
 VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest point of the vehicle, rounded up
-#: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
-#: number of these points; on longer paths they are farther apart.
-LAMP_STEP_M, LAMP_POINTS = 0.02, 1_000_000
 _AREA_SAMPLES = 500  # along each side of an area
 #: Share of the greatest vertical speed at which a path over the floor may climb; the rest is for the controller.
 _CLIMB_SHARE = 0.5
@@ -213,15 +209,10 @@ def check_below_surface(scenario: Scenario, plan: SurveyPlan) -> None:
 
 
 def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain, plan: SurveyPlan) -> None:
-    """Raises TwinError if a lamp, at a position (3,) in the body, is below the floor on the path at any heading."""
-    corners = plan.outline()
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    along = np.append(np.arange(0.0, lengths[-1], max(LAMP_STEP_M, lengths[-1] / LAMP_POINTS)), lengths[-1])
-    x, y = (np.interp(along, lengths, corners[:, k]) for k in range(2))
-    camera = np.column_stack([x, y, plan.camera_height_at(x, y)])
-    headings = [plan.area.heading, plan.area.heading + np.pi][: 1 + (plan.turns_on_the_spot or plan.flies_arcs)]
-    offset = position_m - camera_m
-    x, y, z = np.concatenate([camera + rotate_lever_arm(heading, offset) for heading in headings]).T
+    """Raises TwinError if a lamp, at a position (3,) in the body, is below the floor on the path."""
+    planned, (forward, left, up) = plan.all_references(), position_m - camera_m
+    c, s = np.cos(planned.yaw), np.sin(planned.yaw)
+    x, y, z = planned.position.T + np.array([c * forward - s * left, s * forward + c * left, np.full(len(c), up)])
     above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
     if (least := above.min()) < 0:
         raise TwinError(
