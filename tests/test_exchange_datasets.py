@@ -174,8 +174,21 @@ def test_calibration_files_are_read_back(contents, name, tmp_path):
         read = read_calibration(tmp_path / kind / name)
         np.testing.assert_allclose(read.left.matrix, rig.left.matrix)
         np.testing.assert_allclose(geometry.inverse(read.right_from_left), rig.left_from_right, atol=1e-12)
-        n = min(len(read.left.distortion), 4 if name == "kalibr.yaml" else 5)
-        np.testing.assert_allclose(read.left.distortion[:n], rig.left.distortion[:n])
+        kept = slice(2, 4) if name == "kalibr.yaml" else slice(min(len(read.left.distortion), 5))
+        np.testing.assert_allclose(read.left.distortion[kept], rig.left.distortion[kept])
+
+
+@pytest.mark.parametrize("k3", [0.003, 0.236, -0.1])
+def test_the_distortion_of_kalibr_is_near_that_with_k3_in_the_whole_image(contents, k3, tmp_path):
+    left = replace(contents.true.left, distortion=np.array([0.05, -0.02, 0.001, -0.002, k3]))
+    calibration_files.export(replace(contents, true=replace(contents.true, left=left)), tmp_path)
+    read = read_calibration(tmp_path / "true" / "kalibr.yaml").left
+    half = np.array(left.size_px) / np.diag(left.matrix)[:2] / 2
+    x, y = (part.ravel() for part in np.meshgrid(*(np.linspace(-side, side, 30) for side in half)))
+    points = np.column_stack([x, y, np.ones(len(x))])
+    dropped = replace(left, distortion=np.array([0.05, -0.02, 0.001, -0.002]))
+    rms = [np.sqrt(np.mean((one.project(points) - left.project(points)) ** 2)) for one in (read, dropped)]
+    assert rms[0] < 0.1 * rms[1]
 
 
 def test_nerfstudio_poses_project_points_into_the_image_that_sees_them(contents, tmp_path):

@@ -66,7 +66,7 @@ def pose_of(table: Any, key: str, file: Path) -> Array:
 
 
 def write_camchain(file: Path, rig: StereoCalibration, body_from_left: Array | None = None) -> None:
-    """Writes a camchain, with T_cam_imu if there is an IMU (in body axes), but no k3, which radtan does not have."""
+    """Writes a camchain, with T_cam_imu if there is an IMU (in body axes), and `_radtan` distortions."""
     tree = {name: _table(camera, name) for name, camera in (("cam0", rig.left), ("cam1", rig.right))}
     tree["cam1"]["T_cn_cnm1"] = rig.right_from_left.tolist()
     if body_from_left is not None:
@@ -82,10 +82,19 @@ def _table(camera: RecordedCamera, name: str) -> dict[str, Any]:
         "camera_model": "pinhole",
         "intrinsics": [float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])],
         "distortion_model": "radtan",
-        "distortion_coeffs": [float(value) for value in camera.distortion[:4]],
+        "distortion_coeffs": _radtan(camera).tolist(),
         "resolution": list(camera.size_px or ()),
         "rostopic": f"/{name}/image_raw",
     }
+
+
+def _radtan(camera: RecordedCamera) -> Array:
+    """Returns k1, k2, p1, p2; k1 and k2 take over what they can of k3, which Kalibr does not have, in the image."""
+    found, k3 = np.array(camera.distortion[:4], np.float64), float(np.append(camera.distortion, 0.0)[4])
+    if k3 and camera.size_px is not None:
+        r = np.linspace(0, np.linalg.norm(np.array(camera.size_px) / np.diag(camera.matrix)[:2]) / 2, 100)
+        found[:2] += np.linalg.lstsq(np.stack([r**3.5, r**5.5], axis=1), k3 * r**7.5)[0]  # weight: pixels at r
+    return found
 
 
 def write_imu(file: Path, imu: RecordedImu) -> None:
