@@ -1,6 +1,6 @@
 """Materials of generated floors: ramps of colours from dark to bright, and structures that move texels along them."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,7 @@ class Painting:
         numbers = np.array([[c.size_m, c.strength, c.noise] for c in covers])
         ramps = np.ascontiguousarray(ramps.swapaxes(1, 2))
         self._colour = np.zeros((*material.shape, 3), np.uint8)  # pages without colours take no RAM
-        self._inputs = material, tone, texel_m, ramps, structure, numbers, lattice_table(rng)
+        self._inputs: tuple[Any, ...] = material, tone, texel_m, ramps, structure, numbers, lattice_table(rng)
         self._painted: list[Part] = []
 
     def within(self, part: Part) -> NDArray[np.uint8]:
@@ -77,6 +77,8 @@ class Painting:
             arguments = *self._inputs, self._colour, left, right
             in_row_bands(lambda first, end: _paint(*arguments, top + first, top + end), bottom - top)
             self._painted.append(part)
+            if part == (0, self._colour.shape[0], 0, self._colour.shape[1]):
+                self._inputs = ()  # frees material and tone
         return self._colour
 
 

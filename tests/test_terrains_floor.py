@@ -98,6 +98,7 @@ def test_parts_of_a_texture_are_those_of_the_whole_and_no_part_is_painted_twice(
     assert np.array_equal(part[inner], whole[inner]) and len(rows) * len(cols) < 0.4 * painted.size
     assert terrain.texture_within(np.array([-1.0, 0.3]), np.array([0.0, 1.0])) is part and len(bands) == 1
     assert np.array_equal(terrain.texture, whole) and len(bands) == 2
+    assert not terrain.colours.begun._inputs  # of which nothing is left to paint
     assert terrain.texture_within(np.array([-2.0, -1.0]), np.array([2.0, 1.0])) is part and len(bands) == 2
 
 
