@@ -13,16 +13,14 @@ from twin.core import geometry
 from twin.core.records import MapGrid, Trajectory
 from twin.estimate.self_check import MIN_POINTS
 from twin.exchange.geotiff import Raster
-from twin.judge.error_classes import error_classes
+from twin.judge.height_classes import asprs_vertical_class_cm, error_classes, iho_orders
 from twin.judge.map_error import cause_shares
-from twin.judge.standards import asprs_vertical_class_cm, iho_orders
 from twin.report.headline import conditions
 from twin.report.html import render_text
-from twin.report.keyframe_coverage import keyframe_coverage
 from twin.report.map_figures import round_below, sampled, section_lines
 from twin.report.run_folder import Keyframes, Network, Run
 from twin.report.run_writer import rings_around
-from twin.report.survey_data import asked_area, errors_by_class, survey_data
+from twin.report.survey_data import asked_area, errors_by_class, keyframe_coverage, survey_data
 
 GRID = MapGrid(-2.0, 1.5, 0.02, 150, 200)
 HEIGHT_M, BASELINE_M = 1.5, 0.2

@@ -9,8 +9,18 @@ from typer.testing import CliRunner
 from twin.cli import app
 from twin.errors import TwinError
 from twin.reproduce import catalogue
-from twin.reproduce.exhibit import Exhibit, Figure, make_table, read_all, write_all
-from twin.reproduce.page_chapter import BEGIN, END, SHOWN, chapter, with_chapter
+from twin.reproduce.exhibit import (
+    BEGIN,
+    END,
+    SHOWN,
+    Exhibit,
+    Figure,
+    chapter,
+    make_table,
+    read_all,
+    with_chapter,
+    write_all,
+)
 from twin.reproduce.tank import TABLES
 
 ROOT = Path(__file__).parent.parent

@@ -307,15 +307,14 @@ def chapter(
     page: Annotated[Path | None, option("Markdown page whose chapter is replaced.")] = None,
 ) -> None:
     """Print the chapter of docs/paper.md that shows the results of `twin reproduce all`, or replace it in a page."""
-    from twin.reproduce import page_chapter
-    from twin.reproduce.exhibit import read_all
+    from twin.reproduce import exhibit
 
-    exhibits, quick = read_all(file)
+    exhibits, quick = exhibit.read_all(file)
     if page is None:
-        print(page_chapter.chapter(exhibits, quick))
+        print(exhibit.chapter(exhibits, quick))
         return
     with outputs.writing(page, "--page"):
-        page_chapter.update(page, exhibits, quick)
+        exhibit.update_chapter(page, exhibits, quick)
 
 
 @app.command("fit-surrogate")

@@ -11,10 +11,10 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
 from twin.core.records import Array
 from twin.report.images import reduced
-from twin.report.keyframe_coverage import KeyframeCoverage
 from twin.report.plotting import WIDTH_IN, add_coordinates, extent_of, height_scale, hillshade, legend_beside, one_panel
 from twin.report.run_folder import Raster, Run
 from twin.report.style import COLOURS
+from twin.report.survey_data import KeyframeCoverage
 
 #: Longest side of a map in a figure [cells]; maps with more cells are subsampled.
 MAP_CELLS = 500

@@ -7,11 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.report import map_figures
-from twin.report.keyframe_coverage import KeyframeCoverage
 from twin.report.map_figures import TRUE_STYLE, map_axes, subsampled
 from twin.report.plotting import WIDTH_IN, drawn, extent_of, hillshade, legend_beside, log_scale, one_panel
 from twin.report.run_folder import Run
 from twin.report.style import COLOURS, ESTIMATES, LABELS
+from twin.report.survey_data import KeyframeCoverage
 
 PATH_STYLES: dict[str, dict[str, Any]] = {"reference": {"linestyle": "--", "linewidth": 1.0}, "truth": TRUE_STYLE}
 

@@ -9,17 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.user_files import read_text
+from twin.judge.height_classes import asprs_vertical_class_cm, iho_orders
 from twin.judge.map_error import cause_shares
-from twin.judge.standards import asprs_vertical_class_cm, iho_orders
 from twin.report.headline import REPLAY_ALIGNMENTS, badge, conditions, headline, input_rows, key_figures, problems
 from twin.report.html import render_page, render_text
 from twin.report.images import jpeg_bytes, read_rgb
-from twin.report.keyframe_coverage import keyframe_coverage
 from twin.report.mesh_picture import surface_picture
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.stage_tables import PROCESSING_STAGES, stage_rows, stage_times
 from twin.report.style import COLOURS, ESTIMATES, LABELS
-from twin.report.survey_data import SurveyData, asked_area, errors_by_class, survey_data
+from twin.report.survey_data import SurveyData, asked_area, errors_by_class, keyframe_coverage, survey_data
 from twin.report.survey_figures import draw_all
 
 #: Longest side of an image in the report [px].
