@@ -14,8 +14,7 @@ import pytest
 import twin.session.conclusion
 import twin.session.flown_survey
 from twin import cli, survey
-from twin.app.termination import sigterm_as_interrupt
-from twin.core.interrupts import StageGuard
+from twin.core.interrupts import StageGuard, sigterm_as_interrupt
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.estimate.pipeline import Navigator

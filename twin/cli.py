@@ -19,7 +19,7 @@ import typer
 
 from twin import api
 from twin.app import console, outputs
-from twin.app.termination import INTERRUPTED, sigterm_as_interrupt
+from twin.core.interrupts import INTERRUPTED, sigterm_as_interrupt
 from twin.core.output_folder import sole_writer
 from twin.core.user_files import resolved
 from twin.errors import TwinError

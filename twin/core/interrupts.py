@@ -1,6 +1,7 @@
 """Handling of interrupts (Ctrl-C, SIGTERM), which end only the current stage of a survey; later stages still run."""
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,6 +9,8 @@ from types import FrameType
 from typing import Any, Self, TypeVar
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Exit status after Ctrl-C and after SIGTERM: 128 plus the number of the signal, as in a shell.
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 T = TypeVar("T")
 
 
@@ -80,3 +83,27 @@ def _is_interrupt(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
+
+
+@contextmanager
+def sigterm_as_interrupt() -> Iterator[None]:
+    """Raises KeyboardInterrupt at a SIGTERM in this context (main thread only), and exits with 143 instead of 130."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal received
+        received = True
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    except SystemExit as end:
+        if received and end.code == INTERRUPTED:
+            sys.exit(TERMINATED)
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, previous)
