@@ -13,7 +13,6 @@ from twin.errors import ScenarioError, UnmodelledError
 from twin.studies import flight, sentences
 from twin.studies.analysis import StudyAnalysis, mask_numbers
 from twin.studies.flight import row_of
-from twin.studies.influence import influences
 from twin.studies.report import summary as summary_of
 from twin.studies.report import write_report
 from twin.studies.results_log import ResultsLog
@@ -69,7 +68,7 @@ def test_the_first_screen_answers_in_one_sentence_of_everyday_words(study, analy
 
 
 def test_what_changes_the_result_most_is_told_by_the_surveys_at_its_ends(study, analysis):
-    largest = influences(analysis)[0]
+    largest = analysis.influences[0]
     assert largest.key == "water.turbidity" and [end.passed for end in largest.ends] == [1.0, 0.0]
     turbidity = np.sort(analysis.numbers("vary.water.turbidity"))
     median = np.median(analysis.numbers("map.le90_m")[analysis.numbers("vary.water.turbidity") <= turbidity[6]])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from twin.core.records import Mask
 from twin.judge.map_error import with_completeness
+from twin.judge.summary_statistics import percentile
 from twin.judge.verdict import SIGNED, more_is_better
 from twin.studies import statistics
 from twin.studies.answers import (
@@ -30,6 +31,7 @@ from twin.studies.statistics import UNDEFINED, Array, Interval, Proportion, Sobo
 from twin.studies.study_file import FIDELITY, Study
 
 _MAX_REASONS = 12
+_LEAST_EXPLAINED = 0.05  # of the variance; less is hardly distinguishable from chance
 _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them
 
 
@@ -53,6 +55,20 @@ class Sensitivity(NamedTuple):
     def strength(self) -> float:
         """Returns the larger of |correlation| and the square root of the explained variance; 0 if undefined."""
         return float(np.nanmax([abs(self.correlation.value), self.explained**0.5, 0.0]))
+
+
+class KeyEnd(NamedTuple):
+    """Surveys at one end of a key."""
+
+    values: str  #: smallest and largest value of the key in them
+    passed: float  #: fraction that passed
+    median: float | None  #: of the first metric, over the completed ones; None without one
+
+
+class Influence(NamedTuple):
+    key: str
+    explained: float  #: fraction of the variance of pass or fail, or else of the first metric, that the key explains
+    ends: tuple[KeyEnd, KeyEnd]  #: smallest and largest values; of a text, those of which fewest and most passed
 
 
 class FailureReason(NamedTuple):
@@ -207,6 +223,26 @@ class StudyAnalysis:
         correlation = UNDEFINED if x is None else statistics.rank_correlation(x[included], y[included])
         groups, _ = self.key_groups(key, included)
         return Sensitivity(key, metric, correlation, statistics.explained_variance(groups, y[included]))
+
+    @property
+    def influences(self) -> list[Influence]:
+        """Returns the influence of each varied key that has a clear one, the largest first."""
+        if not self.evaluated.any():
+            return []
+        metric, passed = next(iter(self.metrics), ""), self.passed[self.evaluated].astype(float)
+        values = np.where(self.included(metric), self.numbers(metric), np.nan)[self.evaluated]
+        result, found = passed if np.ptp(passed) else values, list[Influence]()
+        known = np.isfinite(result)
+        for key in self.keys:
+            groups, names = self.key_groups(key, self.evaluated)
+            members = [groups == k for k in range(len(names))]
+            if self.key_numbers(key) is None:
+                members.sort(key=lambda one: passed[one].mean())
+            parts = [(names[groups[one][0]], passed[one].mean(), values[one]) for one in members]
+            ends = [KeyEnd(name, share, percentile(v[np.isfinite(v)], 50)) for name, share, v in parts]
+            explained = statistics.explained_variance(groups[known], result[known])
+            found.append(Influence(key, explained, (ends[0], ends[-1])))
+        return sorted((one for one in found if one.explained > _LEAST_EXPLAINED), key=lambda one: -one.explained)
 
     @cached_property
     def sobol(self) -> dict[str, dict[str, SobolIndex]]:

@@ -13,7 +13,6 @@ from twin.report.words import words
 from twin.studies.analysis import StudyAnalysis, count_similar
 from twin.studies.answers import Answer, KeyLimit, rounded
 from twin.studies.conditions import condition_lines, varied_in_words
-from twin.studies.influence import influences
 from twin.studies.statistics import LEVEL, Interval, Proportion
 
 
@@ -68,7 +67,7 @@ def paragraphs(analysis: StudyAnalysis) -> list[Paragraph]:
         "refused": _refusals(analysis, analysis.refused & ~analysis.unmodelled),
         "unmodelled": _refusals(analysis, analysis.unmodelled),
         "n_warned": f"{int((different != '').sum())} of {len(different)}",
-        "influences": influences(analysis)[:2],
+        "influences": analysis.influences[:2],
         "varied": varied_in_words(study),
         "conditions": condition_lines(study),
         "sentences": sys.modules[__name__],
