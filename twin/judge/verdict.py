@@ -1,10 +1,9 @@
 """Verdict on the metrics of a survey: requirements of its scenario, and warnings of values that are out of bounds."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from twin.core.nested import leaves
 from twin.errors import TwinError
 
 #: Prefixes of metrics whose limit is a lower bound. The limit of every other metric is an upper bound.
@@ -50,6 +49,15 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
             similar = (completions or difflib.get_close_matches(name, known, cutoff=0.5))[:3]
             hint = f", did you mean {' or '.join(similar)}?" if similar else ""
             raise TwinError(f"require.{name}", f"no such metric{hint}", "a dotted name of metrics.json")
+
+
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the dotted keys and the values of nested tables; a list is one value."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
 
 
 def numbers_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:

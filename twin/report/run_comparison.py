@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.core.nested import leaves
 from twin.core.user_files import resolved
 from twin.errors import TwinError
 from twin.judge.map_error import INFINITE_WITH_HOLES
-from twin.judge.verdict import more_is_better, numbers_of
+from twin.judge.verdict import leaves, more_is_better, numbers_of
 from twin.report.headline import badge, first_lines
 from twin.report.html import render_page, render_paragraphs
 from twin.report.number_formats import DASH, is_fraction, metric_value, ratio

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from twin.core.nested import leaves
 from twin.errors import ScenarioError, TwinError, UnmodelledError
+from twin.judge.verdict import leaves
 from twin.studies.surveys import Sample, Survey
 
 Row = dict[str, Any]
