@@ -13,8 +13,7 @@ from twin.imaging.light.spectra import NM
 from twin.imaging.light.water import read_spectrum
 from twin.scenario.file import dump_toml, load_scenario
 from twin.scenario.model import EstimateConfig, Scenario
-from twin.scenario.toml_lines import key_lines
-from twin.scenario.toml_text import value_errors
+from twin.scenario.toml_text import key_lines, value_errors
 from twin.studies.study_file import load_study
 from twin.studies.surveys import surveys
 

@@ -5,7 +5,7 @@ import pytest
 from twin.errors import ScenarioError
 from twin.scenario.file import dump_toml, load_scenario, read_toml, read_tree, with_values
 from twin.scenario.model import Source
-from twin.scenario.model_files import NAVIGATION, RIG
+from twin.scenario.model_files import RIG, built_in
 
 OWN = """
 title = "mine"
@@ -35,21 +35,21 @@ def scenario(folder, text, *overrides):
     return load_scenario(folder / "scene.toml", overrides)
 
 
-@pytest.mark.parametrize("name", RIG.built_in())
+@pytest.mark.parametrize("name", built_in("rigs"))
 def test_every_rig_can_be_flown_in_every_scene_and_says_where_its_numbers_come_from(name):
     for scene in ("quickstart", "paper"):
         assert load_scenario(scene, [f"rig.model={name}"]).rig.title
-    tree, _ = read_toml(RIG.built_in()[name])
+    tree, _ = read_toml(built_in("rigs")[name])
     for section in set(RIG.replaced) & tree.keys():
         assert any(key.split(".")[0] == section for key in tree["sources"]), section
 
 
-@pytest.mark.parametrize("name", NAVIGATION.built_in())
+@pytest.mark.parametrize("name", built_in("navigations"))
 def test_every_set_of_navigation_sensors_fits_every_scene_and_says_where_its_numbers_come_from(name):
     for scene in ("reef", "paper"):
         found = load_scenario(scene, [f"navigation.model={name}", "navigation.dvl_rate_hz=5"]).navigation
         assert found.title and found.aiding and found.dvl_rate_hz == 5
-    tree, _ = read_toml(NAVIGATION.built_in()[name])
+    tree, _ = read_toml(built_in("navigations")[name])
     named = {key.strip() for keys in tree["sources"] for key in keys.split(",")}
     assert named == {*tree["navigation"], *(["imu"] if "imu" in tree else [])}
 

@@ -7,7 +7,7 @@ from twin import survey
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario, read_toml
 from twin.scenario.model import VehicleConfig
-from twin.scenario.model_files import VEHICLE
+from twin.scenario.model_files import built_in
 from twin.simulate.autopilot import top_speed_mps
 from twin.simulate.parameters import parameters_of
 from twin.world.mission import prepare
@@ -22,9 +22,9 @@ def vehicle(name):
     return load_scenario("reef", [f"vehicle.model={name}"]).vehicle
 
 
-@pytest.mark.parametrize("name", VEHICLE.built_in())
+@pytest.mark.parametrize("name", built_in("vehicles"))
 def test_every_number_of_a_vehicle_has_a_source(name):
-    tree, _ = read_toml(VEHICLE.built_in()[name])
+    tree, _ = read_toml(built_in("vehicles")[name])
     named = {key.strip() for keys in tree["sources"] for key in keys.split(",")}
     assert named == set(tree["vehicle"]) and vehicle(name).title == tree["title"]
 
@@ -49,7 +49,7 @@ def test_eight_thrusters_control_all_six_degrees_of_freedom_and_six_all_but_pitc
     np.testing.assert_allclose(np.abs(heavy[5, :4]), (0.156 + 0.111) * np.sqrt(0.5))
 
 
-@pytest.mark.parametrize("name", sorted({*VEHICLE.built_in()} - {"auv"}))  # it needs more room: test_world_auv.py
+@pytest.mark.parametrize("name", sorted({*built_in("vehicles")} - {"auv"}))  # it needs more room: test_world_auv.py
 @pytest.mark.long
 def test_every_vehicle_follows_a_plan(tmp_path, name):
     overrides = [*SMALL, f"vehicle.model={name}"]

@@ -13,7 +13,7 @@ from twin.core import geometry
 from twin.errors import TwinError
 from twin.scenario.file import load_scenario
 from twin.scenario.model import CurrentConfig, Scenario, VehicleConfig, WavesConfig
-from twin.scenario.model_files import VEHICLE
+from twin.scenario.model_files import built_in
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.mujoco_vehicle import MujocoVehicle
@@ -219,7 +219,7 @@ def integrated(section, sea, start, commands, period_s):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("model", [*VEHICLE.built_in(), "coupled"])
+@pytest.mark.parametrize("model", [*built_in("vehicles"), "coupled"])
 def test_trajectories_agree_with_an_independent_integration(model):
     """Random thrust and angles of fins in a sheared, gusty, wavy current, 30 or 20 s: within 1 mm and 0.1 deg."""
     if model == "coupled":

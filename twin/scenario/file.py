@@ -15,10 +15,9 @@ from pydantic import BaseModel, ValidationError
 
 from twin.core.user_files import is_file, read_text, resolved
 from twin.errors import ScenarioError, TwinError, did_you_mean
+from twin.scenario import toml_text
 from twin.scenario.model import Scenario, Source
-from twin.scenario.model_files import KINDS, ModelKind
-from twin.scenario.toml_lines import key_lines
-from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVELS, parse_toml, value_errors
+from twin.scenario.model_files import KINDS, built_in
 
 Model = TypeVar("Model", bound=BaseModel)
 Describe = Callable[[TwinError], str]
@@ -145,18 +144,12 @@ def find_scene(path: str | Path) -> Path:
     candidate = Path(path)
     if is_file(candidate):
         return candidate
-    files = _built_in_scenes()
+    files = built_in()
     name = str(path).removesuffix(".toml").removeprefix("scenes/")
     if name in files:
         return files[name]
     hint, allowed = did_you_mean(str(path), list(files)), f"a file, or one of {', '.join(files)}"
     raise ScenarioError([f"{shown(str(path))}: no such scenario{hint} (allowed: {allowed})"])
-
-
-def _built_in_scenes() -> dict[str, Path]:
-    from twin import scenes
-
-    return {file.stem: file for file in sorted(Path(scenes.__file__).parent.glob("*.toml"))}
 
 
 def dump_toml(scenario: Scenario) -> str:
@@ -185,7 +178,7 @@ def input_files(scenario: Scenario) -> list[Path]:
 
 @lru_cache(maxsize=16)  # the surveys of a study read the same files
 def _parsed(text: str) -> tuple[dict[str, Any], dict[str, int]]:
-    return parse_toml(text), key_lines(text)
+    return toml_text.parse_toml(text), toml_text.key_lines(text)
 
 
 def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
@@ -194,7 +187,7 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
     Raises ScenarioError if the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
     """
     try:
-        text = read_text(file, most_bytes=4 * MAX_CHARACTERS, encoding="utf-8-sig")
+        text = read_text(file, most_bytes=4 * toml_text.MAX_CHARACTERS, encoding="utf-8-sig")
     except TwinError as error:
         raise ScenarioError([f"{file}:1: {error.problem}"]) from None
     try:
@@ -203,7 +196,8 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         line = re.search(r"line (\d+)", str(error))
         number = line[1] if line else min(len(text.splitlines()), text.count("\n") + 1)
         raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
-    if errors := [Source(path=file, lines=lines).describe(error) for error in islice(value_errors(tree), _MAX_ERRORS)]:
+    source = Source(path=file, lines=lines)
+    if errors := [source.describe(error) for error in islice(toml_text.value_errors(tree), _MAX_ERRORS)]:
         raise ScenarioError(errors)
     return tree, lines
 
@@ -226,8 +220,8 @@ def _read_with_base(file: Path, including: tuple[Path, ...] = ()) -> tuple[dict[
     if base is None:
         return _merged(tree, {}, source), source, errors
     base_file = resolved(file.parent / str(base))
-    if not is_file(base_file) and (base_file := _built_in_scenes().get(str(base))) is None:
-        allowed = f"a path relative to this file, or one of {', '.join(_built_in_scenes())}"
+    if not is_file(base_file) and (base_file := built_in().get(str(base))) is None:
+        allowed = f"a path relative to this file, or one of {', '.join(built_in())}"
         message = f"no such file {shown(repr(str(base)))} (allowed: {allowed})"
         raise ScenarioError([*errors, f"{file}:{lines.get('extends', 1)}: extends: {message}"])
     base_tree, base_source, base_errors = _read_with_base(base_file, (*including, resolved(file)))
@@ -249,20 +243,17 @@ def _take_models(tree: dict[str, Any], base: dict[str, Any], folder: Path, descr
     """
     for kind in KINDS:
         section = tree.get(kind.name)
-        if isinstance(section, dict) and isinstance(section.get("model"), str):  # else refused by the validation
-            _take_model(kind, section.pop("model"), base, folder, describe)
-
-
-def _take_model(kind: ModelKind, model: str, base: dict[str, Any], folder: Path, describe: Describe) -> None:
-    try:
-        file = kind.find(model, folder)
-    except TwinError as error:
-        raise ScenarioError([describe(error)]) from None
-    sections, lines = read_toml(file)
-    validated(sections, kind.contents, Source(path=file, lines=lines))
-    for key in kind.replaced:
-        base.pop(key, None)
-    base |= kind.sections_of(sections)
+        if not isinstance(section, dict) or not isinstance(section.get("model"), str):
+            continue  # what is no text is refused by the validation
+        try:
+            file = kind.find(section.pop("model"), folder)
+        except TwinError as error:
+            raise ScenarioError([describe(error)]) from None
+        sections, lines = read_toml(file)
+        validated(sections, kind.contents, Source(path=file, lines=lines))
+        for key in kind.replaced:
+            base.pop(key, None)
+        base |= kind.sections_of(sections)
 
 
 def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any]) -> None:
@@ -288,15 +279,11 @@ def _absolute(key: str, value: Any, folder: Path) -> Any:
         return {name: _absolute(f"{key}.{name}" if key else name, item, folder) for name, item in value.items()}
     if isinstance(value, list):
         return [_absolute(key, item, folder) if isinstance(item, dict) else item for item in value]
-    return str(_expand(value, folder)) if isinstance(value, str) and _is_path_key(key) else value
-
-
-def _expand(value: str, folder: Path) -> Path:
-    """Returns the absolute path of a file in a folder; one in ${TWIN_DATA} may refer to the current folder."""
-    data = os.environ.get("TWIN_DATA", "../shared/data")
-    if "${TWIN_DATA}" in value:
-        return resolved(Path(value.replace("${TWIN_DATA}", data)))
-    return resolved(folder / value)
+    if not isinstance(value, str) or not _is_path_key(key):
+        return value
+    data = os.environ.get("TWIN_DATA", "../shared/data")  # which may refer to the current folder
+    in_data = Path(value.replace("${TWIN_DATA}", data))
+    return str(resolved(in_data if "${TWIN_DATA}" in value else folder / value))
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
@@ -312,8 +299,8 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     key = key.strip()
     if not equals or not key:
         raise ScenarioError([f"--set {shown(override)}: not of the form key=value (for instance plan.tracks=2)"])
-    if len(key) > MAX_KEY_CHARACTERS or key.count(".") >= MAX_LEVELS:
-        allowed = f"up to {MAX_KEY_CHARACTERS} characters and {MAX_LEVELS} levels"
+    if len(key) > toml_text.MAX_KEY_CHARACTERS or key.count(".") >= toml_text.MAX_LEVELS:
+        allowed = f"up to {toml_text.MAX_KEY_CHARACTERS} characters and {toml_text.MAX_LEVELS} levels"
         raise ScenarioError([f"--set {shown(override)}: not a key (allowed: {allowed})"])
     if new_key := _renamed(key):
         raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
@@ -326,14 +313,14 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
 def _override_value(key: str, text: str) -> Any:
     """Returns the TOML value in the text of an override, within limits; the text itself if it is not a single value."""
     try:
-        given = parse_toml(f"v = {text}")
+        given = toml_text.parse_toml(f"v = {text}")
     except tomllib.TOMLDecodeError:
         return text
     except ValueError as error:
         raise ScenarioError([f"--set: {TwinError(key, str(error))}"]) from None
     if given.keys() != {"v"}:  # the text has further lines with keys of their own
         return text
-    for error in value_errors({key: given["v"]}):
+    for error in toml_text.value_errors({key: given["v"]}):
         raise ScenarioError([f"--set: {error}"])
     return given["v"]
 

@@ -55,6 +55,13 @@ class NavigationFile(Section):
     imu: ImuConfig | None = None
 
 
+def built_in(folder: str = "") -> dict[str, Path]:
+    """Returns the TOML files in scenes/, or in a folder of it, by name, in alphabetical order."""
+    from twin import scenes
+
+    return {file.stem: file for file in sorted((Path(scenes.__file__).parent / folder).glob("*.toml"))}
+
+
 class ModelKind(NamedTuple):
     """What a file of scenes/ can describe: `name`.model is the key that names it."""
 
@@ -67,16 +74,9 @@ class ModelKind(NamedTuple):
     def key(self) -> str:
         return f"{self.name}.model"
 
-    def built_in(self) -> dict[str, Path]:
-        """Returns the files of this kind in scenes/ by name, in alphabetical order."""
-        from twin import scenes
-
-        folder = Path(scenes.__file__).parent / f"{self.name}s"
-        return {file.stem: file for file in sorted(folder.glob("*.toml"))}
-
     def find(self, model: str, folder: Path) -> Path:
         """Returns the file of a built-in name, or of a path relative to a folder; raises TwinError if there is none."""
-        if model in (files := self.built_in()):
+        if model in (files := built_in(f"{self.name}s")):
             return files[model]
         if is_file(file := resolved(folder / model)):
             return file

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from twin.errors import ScenarioError
 from twin.report.words import values_in_words
 from twin.scenario.file import read_toml, read_tree
 from twin.scenario.idealisations import idealisations
+from twin.scenario.model_files import built_in
 from twin.studies.distribution import Distribution
 from twin.studies.study_file import Study, flat_keys, named_keys
 from twin.studies.surveys import samples, scenario_of_sample
@@ -57,17 +57,12 @@ def varied_in_words(study: Study) -> list[str]:
 def _missing(study: Study) -> tuple[dict[str, Any], dict[str, Distribution]]:
     """Returns the fixed and the varied conditions of the sea trial that neither a study nor its scenario sets."""
     given, tree = {key for _, key in named_keys(study)}, read_tree(study.scenario_file)
+    preset = read_toml(built_in("conditions")["sea_trial"])[0]
     fixed, varied = (
-        {key: value for key, value in flat_keys(_preset()[part]) if key not in given and not _sets(tree, key)}
+        {key: value for key, value in flat_keys(preset[part]) if key not in given and not _sets(tree, key)}
         for part in ("set", "vary")
     )
     return fixed, {key: Distribution.model_validate(law) for key, law in varied.items()}
-
-
-def _preset() -> dict[str, Any]:
-    from twin import scenes
-
-    return read_toml(Path(scenes.__file__).parent / "conditions" / "sea_trial.toml")[0]
 
 
 def _sets(tree: Mapping[str, Any], key: str) -> bool:
