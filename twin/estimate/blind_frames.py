@@ -1,6 +1,6 @@
 """Frames whose motion was predicted, not measured: their poses between the measured frames before and after them."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +45,10 @@ def aligned(
     path are held on one side only, those at its beginning stay as they are.
     """
     path = path.copy()
-    for frames in _runs([frame for frame in blind if frame.row not in keyframes]):
+    free = [frame for frame in blind if frame.row not in keyframes]
+    starts = np.flatnonzero(np.diff([frame.row for frame in free], prepend=-2) != 1)  # of runs of consecutive rows
+    for start, stop in zip(starts, [*starts[1:], None], strict=False):
+        frames = free[start:stop]
         first, end = frames[0].row - 1, frames[-1].row + 1
         if first < 0:
             continue
@@ -70,15 +73,3 @@ def _weighted(frames: Sequence[BlindFrame]) -> list[BlindFrame]:
         frame._replace(cov=factor * frame.cov) if frame.guessed else frame
         for frame, factor in zip(frames, growth, strict=True)
     ]
-
-
-def _runs(frames: Sequence[BlindFrame]) -> Iterator[list[BlindFrame]]:
-    """Yields the frames in consecutive rows."""
-    run: list[BlindFrame] = []
-    for frame in frames:
-        if run and frame.row != run[-1].row + 1:
-            yield run
-            run = []
-        run.append(frame)
-    if run:
-        yield run

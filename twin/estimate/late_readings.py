@@ -1,5 +1,6 @@
 """Readings that are older than the last frame, or that no node has: their motion to the time at which they are used."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -65,7 +66,7 @@ class ReadingsBetweenNodes:
     def give_to_nodes(self, nodes: Sequence[Keyframe], log: PoseLog) -> None:
         """Gives the kept readings to the first node that is not before them, unless it has its own."""
         for name, (time_s, value) in list(self._waiting.items()):
-            k = _first_not_before(nodes, log.times_s.array, time_s)
+            k = bisect_left(nodes, time_s - _SAME_S, key=lambda node: log.times_s.array[node.row])
             if k == len(nodes):
                 continue
             del self._waiting[name]
@@ -88,11 +89,3 @@ class ReadingsBetweenNodes:
             return geometry.rpy_from_rotation(turned)
         moved_m = world_from_camera[:3, 3] - before[:3, 3]
         return value + (moved_m if name == "usbl_m" else float(moved_m[2]))
-
-
-def _first_not_before(nodes: Sequence[Keyframe], times_s: Array, time_s: float) -> int:
-    """Returns the number of nodes before a time."""
-    k = len(nodes)
-    while k > 0 and times_s[nodes[k - 1].row] >= time_s - _SAME_S:
-        k -= 1
-    return k
