@@ -87,9 +87,7 @@ SummaryJson = Annotated[bool, option("Print only a summary, as JSON.", flag="--j
 
 def main() -> None:
     """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
-    console.open_closed_streams()
-    console.accept_any_text()
-    console.hide_log_failures()
+    console.prepare_streams()
     _set_up_openblas()
     with sigterm_as_interrupt():
         try:

@@ -31,8 +31,18 @@ def print_error(text: str) -> None:
     print("".join(printable), file=sys.stderr)
 
 
-def hide_log_failures() -> None:
-    """Hides the traceback that rasterio prints if GDAL's message quotes bytes of a damaged file that are not UTF-8."""
+def prepare_streams() -> None:
+    """Opens the null device in place of closed standard streams, whose numbers the next files would get.
+
+    Sets stdout to print a backslash escape for each character that its encoding cannot represent. Hides the traceback
+    that rasterio prints if GDAL's message quotes bytes of a damaged file that are not UTF-8.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     default = sys.unraisablehook
 
     def hook(failure: "sys.UnraisableHookArgs") -> None:
@@ -40,14 +50,6 @@ def hide_log_failures() -> None:
             default(failure)
 
     sys.unraisablehook = hook
-
-
-def open_closed_streams() -> None:
-    """Opens the null device in place of closed standard streams, whose numbers the next files would get."""
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:
-            os.dup2(os.open(os.devnull, os.O_RDWR), number)
-            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))
 
 
 def refuse_little_memory() -> None:
@@ -78,12 +80,6 @@ def machine_errors() -> Iterator[None]:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the flush at the end of the program fails again
         raise TwinError(str(error.filename or "stdout"), str(error.strerror), "one that can be written") from None
-
-
-def accept_any_text() -> None:
-    """Sets stdout to print a backslash escape for each character that its encoding cannot represent."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
