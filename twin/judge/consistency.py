@@ -31,8 +31,11 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
 def position_consistency(
     result: SurveyResult, moved: Array, true: Array, keyframes: NDArray[np.int64]
 ) -> dict[str, float | None]:
-    """Returns the metrics of poses (n, 4, 4) of keyframes `keyframes` (n,), moved to the truth, and of true poses."""
-    error, cov = _errors_in_camera(moved, true, result.node_cov[keyframes, 3:, 3:])
+    """Returns the metrics of keyframes (n,) with positive definite covariances, of their poses moved to the truth."""
+    in_world, cov = moved[:, :3, 3] - true[:, :3, 3], result.node_cov[keyframes, 3:, 3:]
+    finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
+    usable = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0] > 0
+    error, cov = np.einsum("nji,nj->ni", moved[:, :3, :3], in_world)[usable], cov[usable]  # both in camera axes
     low, high = nees_interval(result.quality.independent_errors) or (None, None)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     return {
@@ -41,15 +44,6 @@ def position_consistency(
         "nees_position_high": high,
         "within_2sigma_position": mean(np.abs(error) <= 2 * sigma),
     }
-
-
-def _errors_in_camera(moved: Array, true: Array, cov: Array) -> tuple[Array, Array]:
-    """Returns errors of positions (n, 3) [m] and covariances (n, 3, 3), both in camera axes; positive definite ones."""
-    in_world = moved[:, :3, 3] - true[:, :3, 3]
-    in_camera = np.einsum("nji,nj->ni", moved[:, :3, :3], in_world)
-    finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
-    usable = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0] > 0
-    return in_camera[usable], cov[usable]
 
 
 def nees(error: Array, cov: Array) -> Array:

@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core.quality import ActionTimes, Energy, Gaps
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
@@ -26,7 +27,6 @@ from twin.judge.recorded import (
 from twin.judge.summary_statistics import finite_float, finite_tree
 from twin.judge.survey_quality import self_check_metrics, stereo_quality
 from twin.judge.swaths import control_metrics, overlap_metrics
-from twin.judge.task_errors import SurveyedTask, task_metrics
 from twin.judge.trajectory_errors import path_errors, track_metrics, trajectory_metrics
 from twin.judge.verdict import check_metric_names, judge_requirements, metric_warnings
 
@@ -34,6 +34,16 @@ SCHEMA = "twin.metrics/2"
 #: `replay` of a replay that was not evaluated, besides the description of its data set.
 _NOT_COMPARED = {"alignment": None, "frames_with_truth": 0, "network": dict.fromkeys(NETWORK_KEYS)}
 _IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason")
+
+
+class SurveyedTask(NamedTuple):
+    """Task of a survey with its map."""
+
+    name: str
+    track: int  #: number of its track, from 1
+    elevation: ElevationMap | None  #: map from the keyframes of its track
+    truth: Truth  #: truth at the cells of this map
+    in_area: NDArray[np.bool_]  #: (rows, cols) cells of the map of the area that lie in the asked part of the task
 
 
 @dataclass(frozen=True)
@@ -125,6 +135,31 @@ def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
         "tasks": [task_metrics(task, result, elevation, truth) for task in survey.tasks],
         "overlap": overlap_metrics(result, truth, survey.rig, grid, survey.plan),
     }
+
+
+def task_metrics(
+    task: SurveyedTask, result: SurveyResult, elevation: ElevationMap | None, truth: Truth
+) -> dict[str, Any]:
+    """Returns an item of `tasks[]` of metrics.json.
+
+    The keys of `map.*` are those of the map of the task; area_map_le90_m is LE90 of the map of the area over the same
+    ground. error_before_m and error_after_m are the errors of the online position at the frames before the first and
+    after the last frame of its track: at the place where the survey was broken off.
+    """
+    error_m, frames = path_errors(result.online, truth.trajectory).distance_m, np.flatnonzero(truth.track == task.track)
+    there = replace(truth, seen=truth.seen & task.in_area, asked=truth.asked & task.in_area)
+    return {
+        "name": task.name,
+        "track": task.track,
+        **map_metrics(task.elevation, task.truth),
+        "area_map_le90_m": map_metrics(elevation, there)["le90_m"],
+        "error_before_m": _at(error_m, int(frames[0]) - 1) if len(frames) else None,
+        "error_after_m": _at(error_m, int(frames[-1])) if len(frames) else None,
+    }
+
+
+def _at(error_m: NDArray[np.float64], frame: int) -> float | None:
+    return float(error_m[frame]) if 0 <= frame < len(error_m) else None
 
 
 def _replay_sections(survey: EvaluationInput, truth: RecordedTruth) -> dict[str, Any]:

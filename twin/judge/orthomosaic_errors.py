@@ -4,8 +4,6 @@ The displacement of patches is that of the peak of their normalised cross-correl
 CIEDE2000 (Sharma, Wu & Dalal 2005, doi 10.1002/col.20070).
 """
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -56,15 +54,11 @@ class OrthomosaicJudge:
         self._n_asked += int(asked.sum())
         self._n_known += int((asked & tile.known).sum())
         known = tile.known & np.isfinite(albedo[..., 0])
-        if self._restored:
-            self._compare_colours(tile.rgba[..., :3], albedo, known)
+        if self._restored:  # the colour differences of some known pixels
+            some = np.s_[::_COLOUR_STEP_PX, ::_COLOUR_STEP_PX]
+            colours = (lab_of(picture[some][known[some]] / 255.0) for picture in (tile.rgba[..., :3], albedo))
+            self._colours += np.histogram(np.minimum(ciede2000(*colours), _BINS[-1]), _BINS)[0]
         self._match(tile.rgba[..., :3] @ _LUMINANCE, np.nan_to_num(albedo) @ _LUMINANCE, known)
-
-    def _compare_colours(self, rgb: NDArray[np.uint8], albedo: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
-        """Adds the colour differences of some known pixels to the histogram."""
-        some = np.s_[::_COLOUR_STEP_PX, ::_COLOUR_STEP_PX]
-        colours = (lab_of(picture[some][known[some]] / 255.0) for picture in (rgb, albedo))
-        self._colours += np.histogram(np.minimum(ciede2000(*colours), _BINS[-1]), _BINS)[0]
 
     def _match(self, shown: Layer, true: Layer, known: NDArray[np.bool_]) -> None:
         """Counts the patches that are known over the search range; adds displacement and spectra of those found."""
@@ -79,11 +73,11 @@ class OrthomosaicJudge:
                 shift = patch_shift(patch, np.ascontiguousarray(true[around], np.float32), LEAST_CORRELATION)
                 if shift is None:
                     continue
-                self._shifts.append((shift.right_px, -shift.down_px))
-                down, right = round(shift.down_px), round(shift.right_px)
+                right_px, down_px = shift
+                self._shifts.append((right_px, -down_px))
+                right, down = round(right_px), round(down_px)
                 same = true[row - down : row - down + n, col - right : col - right + n]
-                rest = shift._replace(right_px=shift.right_px - right, down_px=shift.down_px - down)
-                self._spectra += np.array(transfer(patch, same, rest))
+                self._spectra += np.array(transfer(patch, same, (right_px - right, down_px - down)))
 
     def metrics(self) -> dict[str, float | None]:
         """Returns `orthomosaic.*` of metrics.json; every value is None without an orthomosaic.
@@ -144,15 +138,8 @@ def _times(value: float | None, factor: float | None) -> float | None:
     return None if value is None or factor is None else value * factor
 
 
-class PatchShift(NamedTuple):
-    """Position of a patch in the first image minus its position in the second image."""
-
-    right_px: float
-    down_px: float
-
-
-def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchShift | None:
-    """Returns the displacement of a patch (n, n) of the first image against the second image.
+def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> tuple[float, float] | None:
+    """Returns the displacement [px] to the right and down of a patch (n, n) of an image against the second image.
 
     `around` (n + 2 m, n + 2 m) is the part of the second image with the same centre. The peak of the correlation is
     interpolated by a parabola along each axis. None if one of the two has no texture, if the peak is below
@@ -172,7 +159,7 @@ def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchS
         return None
     down = row + _vertex(*score[row - 1 : row + 2, col]) - last / 2
     right = col + _vertex(*score[row, col - 1 : col + 2]) - last / 2
-    return PatchShift(-float(right), -float(down))
+    return -float(right), -float(down)
 
 
 def _vertex(before: float, at: float, after: float) -> float:
@@ -181,18 +168,19 @@ def _vertex(before: float, at: float, after: float) -> float:
     return 0.0 if curvature >= 0 else 0.5 * (before - after) / curvature
 
 
-def transfer(patch: Layer, true: Layer, shift: PatchShift) -> tuple[Array, Array]:
+def transfer(patch: Layer, true: Layer, shift_px: tuple[float, float]) -> tuple[Array, Array]:
     """Returns the cross-spectrum (n, n) of a patch and the true patch, and the power spectrum (n, n) of the true patch.
 
-    Both are weighted by a Hann window. The cross-spectrum is corrected for the displacement `shift`; its real part is
-    returned. The ratio is the modulation transfer function.
+    Both are weighted by a Hann window. The cross-spectrum is corrected for the displacement `shift_px`; its real part
+    is returned. The ratio is the modulation transfer function.
     """
     n = len(patch)
     hann = np.hanning(n + 2)[1:-1]
     taper = hann * hann[:, None]
     first, second = (np.fft.fft2((picture - picture.mean()) * taper) for picture in (patch, true))
     f = np.fft.fftfreq(n)
-    phase = np.exp(2j * np.pi * (f * shift.right_px + f[:, None] * shift.down_px))
+    right_px, down_px = shift_px
+    phase = np.exp(2j * np.pi * (f * right_px + f[:, None] * down_px))
     return np.real(first * phase * np.conj(second)), np.abs(second) ** 2
 
 

@@ -36,7 +36,9 @@ def pose_errors(estimated: Array, true: Array) -> PathErrors:
     """Returns the errors of poses (n, 4, 4) of the left camera that are given in the world of the true ones."""
     heading = geometry.heading_of_camera(estimated) - geometry.heading_of_camera(true)
     position = estimated[:, :3, 3] - true[:, :3, 3]
-    return PathErrors(_cumulative_length(true[:, :3, 3]), position, geometry.wrap_angle(heading))
+    steps_m = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
+    travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])[: len(true)]
+    return PathErrors(travelled_m, position, geometry.wrap_angle(heading))
 
 
 def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
@@ -46,11 +48,6 @@ def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
     if n == 0:
         return pose_errors(true, true)
     return pose_errors(anchor(estimate.world_from_camera[0], true[0]) @ estimate.world_from_camera[:n], true)
-
-
-def _cumulative_length(positions: Array) -> Array:
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])[: len(positions)]
 
 
 def trajectory_metrics(errors: PathErrors) -> dict[str, float | None]:

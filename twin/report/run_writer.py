@@ -29,8 +29,8 @@ from twin.core.records import Array, ElevationMap, MapGrid, SurveyResult, Trajec
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.exchange import posegraph
+from twin.judge.metrics import SurveyedTask
 from twin.judge.network_errors import motion_residuals
-from twin.judge.task_errors import SurveyedTask
 from twin.report.replay_description import RunDescription
 from twin.scenario import file as scenario_file
 from twin.scenario.model import Scenario

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from twin.core.ortho_tiles import at_centres, mean_colours, window
 from twin.core.quality import ActionTimes, Finding, Gaps
 from twin.core.records import ElevationMap, SurveyResult, Truth
-from twin.judge.metrics import EvaluationInput
+from twin.judge.metrics import EvaluationInput, SurveyedTask
 from twin.judge.orthomosaic_errors import OrthomosaicJudge
-from twin.judge.task_errors import SurveyedTask
 from twin.plugin.navigator import NOTE
 from twin.report.run_writer import PlannedTruth, SurveyRecord
 from twin.scenario.idealisations import idealisations
