@@ -253,7 +253,8 @@ def _take_models(tree: dict[str, Any], base: dict[str, Any], folder: Path, descr
         validated(sections, kind.contents, Source(path=file, lines=lines))
         for key in kind.replaced:
             base.pop(key, None)
-        base |= kind.sections_of(sections)
+        base |= {key: sections[key] for key in (*kind.replaced, *kind.optional) if key in sections}
+        base[kind.name] = {**sections[kind.name], "title": sections["title"]}
 
 
 def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any]) -> None:

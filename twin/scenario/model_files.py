@@ -1,8 +1,7 @@
 """Rigs, vehicles, sets of navigation sensors as files: published or own numbers, and their sources."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pydantic import Field
 
@@ -82,11 +81,6 @@ class ModelKind(NamedTuple):
             return file
         hint = did_you_mean(model, list(files))
         raise TwinError(self.key, f"{model!r}: no such {self.name}{hint}", f"a file, or one of {', '.join(files)}")
-
-    def sections_of(self, tree: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the sections that a file, with these keys and values, sets in a scenario."""
-        sections = {key: tree[key] for key in (*self.replaced, *self.optional) if key in tree}
-        return sections | {self.name: {**tree[self.name], "title": tree["title"]}}
 
 
 RIG = ModelKind("rig", RigFile, ("rig", "sensor", "lens", "port", "calibration_error"), ("lamps",))
