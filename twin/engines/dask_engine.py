@@ -39,21 +39,17 @@ def connect_scheduler(address: str) -> Iterator[DaskEngine]:
 @contextmanager
 def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
     """Yields an engine that runs tasks on `jobs` new SLURM jobs; raises TwinError if dask-jobqueue is missing."""
-    with dask.config.set({"distributed.scheduler.allowed-failures": _MAX_LOST_WORKERS}):
-        with _slurm_cluster(jobs) as cluster, Client(cluster) as client:
-            yield DaskEngine(client)
-
-
-def _slurm_cluster(jobs: int) -> Any:
     try:
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError:
         needed = "pip install 'seabed-twin[cluster]'"
         raise TwinError("--scheduler", "slurm needs dask-jobqueue, which is not installed", needed) from None
-    given = dask.config.get("jobqueue.slurm")
-    cluster = SLURMCluster(cores=given.get("cores") or 1, processes=1, memory=given.get("memory") or "4GB")
-    cluster.scale(jobs=jobs)
-    return cluster
+    with dask.config.set({"distributed.scheduler.allowed-failures": _MAX_LOST_WORKERS}):
+        given = dask.config.get("jobqueue.slurm")
+        cluster = SLURMCluster(cores=given.get("cores") or 1, processes=1, memory=given.get("memory") or "4GB")
+        cluster.scale(jobs=jobs)
+        with cluster, Client(cluster) as client:
+            yield DaskEngine(client)
 
 
 class DaskEngine:

@@ -186,15 +186,12 @@ def main(pipe: int, core: int | None) -> None:
             request = connection.recv_bytes()
         except (EOFError, OSError):
             return
-        connection.send_bytes(_run_request(request))
-
-
-def _run_request(request: bytes) -> bytes:
-    try:
-        function, task = pickle.loads(request)
-        return pickle.dumps(Reply("done", function(task)))
-    except BaseException as error:  # every failure becomes a reply; the process must survive
-        return pickle.dumps(Reply("raised", reason=describe_exception(error)))
+        try:
+            function, task = pickle.loads(request)
+            reply = pickle.dumps(Reply("done", function(task)))
+        except BaseException as error:  # every failure becomes a reply; the process must survive
+            reply = pickle.dumps(Reply("raised", reason=describe_exception(error)))
+        connection.send_bytes(reply)
 
 
 def _exit_with_parent(parent: int) -> None:

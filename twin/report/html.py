@@ -20,7 +20,10 @@ _FILTERS = {
 
 def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
     """Returns a template as self-contained HTML; files that are not in `package` are taken from `twin.report`."""
-    return _for_narrow_screens(_rendered(package, template, context, autoescape=True))
+    page = _rendered(package, template, context, autoescape=True)
+    # for narrow screens (page.css), cells carry the names of their columns, and images can have the focus
+    page = re.sub(r"<table>.*?</table>", _with_column_names, page, flags=re.DOTALL)
+    return page.replace("<img ", '<img tabindex="0" ')
 
 
 def render_text(template: str, context: Mapping[str, Any], package: str = _SHARED_TEMPLATES) -> str:
@@ -73,12 +76,6 @@ def _rendered(package: str, template: str, context: Mapping[str, Any], **options
 def _of_defined(number: Callable[[Any], str]) -> Callable[[Any], str]:
     """Returns a number format that takes an undefined value as None."""
     return lambda value: number(None if isinstance(value, jinja2.Undefined) else value)
-
-
-def _for_narrow_screens(page: str) -> str:
-    """Returns a page whose cells carry the names of their columns, and whose images can have the focus (page.css)."""
-    page = re.sub(r"<table>.*?</table>", _with_column_names, page, flags=re.DOTALL)
-    return page.replace("<img ", '<img tabindex="0" ')
 
 
 def _with_column_names(table: re.Match[str]) -> str:

@@ -69,18 +69,13 @@ def _compared(water_type: str, elevation_deg: float, depth_m: float, range_m: fl
         lambda light: within(LIGHT_ERROR, light.total, light.veil),
         walks,
     )
-    return found | {
-        "veil": Compared(float(veil[1, GREEN]), truth.veil, "_cd_m2"),
-        "lu": Compared(_model_lu(daylight, water, range_m), truth.total, "_cd_m2"),
-    }
-
-
-def _model_lu(daylight: Daylight, water: Medium, range_m: float) -> float:
-    """Returns the upwelling green light [cd/m2] at the camera over a floor of albedo `ALBEDO` / 255, by the model."""
     shape = RIG.height_px, RIG.width_px
     albedo, depth = np.full((*shape, 3), ALBEDO, np.uint8), np.full(shape, range_m, np.float32)
     light = Optics(RIG, Illumination(water, daylight), ()).radiance(albedo, depth, 0)
-    return float(light[shape[0] // 2, shape[1] // 2, GREEN])
+    return found | {
+        "veil": Compared(float(veil[1, GREEN]), truth.veil, "_cd_m2"),
+        "lu": Compared(float(light[shape[0] // 2, shape[1] // 2, GREEN]), truth.total, "_cd_m2"),
+    }
 
 
 def plane_lx(daylight: Daylight, normal: Array, depth_m: float) -> float:

@@ -97,29 +97,6 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     return contrast
 
 
-def _summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
-    names = ("gray_level", "contrast", "veil_share", "saturated_share", "snr", "texture_snr")
-    return {
-        "schema": "twin.turbidity/1",
-        "jerlov": JERLOV,
-        "range_m": levels[0].quality["depth_median_m"],
-        "levels": [
-            {
-                "turbidity": level.scenario.water.turbidity,
-                "attenuation_per_m": level.water.attenuation_per_m.tolist(),
-                "gray_level_sd": (level.image.std(axis=(0, 1)) / 255).tolist(),
-                "visibility_m": level.visibility_m,
-            }
-            | {name: level.quality[name] for name in names}
-            for level in levels
-        ],
-        "contrast_left": {
-            "range_m": levels[0].ranges_m.round(3).tolist(),
-            "green": [level.contrast[:, 1].round(5).tolist() for level in levels],
-        },
-    }
-
-
 def table(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Returns the values of a summary for the green band as table rows, the header first."""
     header = ("turbidity", "attenuation c", "contrast", "backscatter", "grey level SD", "texture SNR", "visibility")
@@ -138,7 +115,26 @@ def table(summary: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def write(levels: Sequence[TurbidityLevel], folder: Path) -> dict[str, Any]:
     """Writes turbidity.png and turbidity.json to a folder, which is created if missing; returns the summary."""
-    results = _summary(levels)
+    names = ("gray_level", "contrast", "veil_share", "saturated_share", "snr", "texture_snr")
+    results = {
+        "schema": "twin.turbidity/1",
+        "jerlov": JERLOV,
+        "range_m": levels[0].quality["depth_median_m"],
+        "levels": [
+            {
+                "turbidity": level.scenario.water.turbidity,
+                "attenuation_per_m": level.water.attenuation_per_m.tolist(),
+                "gray_level_sd": (level.image.std(axis=(0, 1)) / 255).tolist(),
+                "visibility_m": level.visibility_m,
+            }
+            | {name: level.quality[name] for name in names}
+            for level in levels
+        ],
+        "contrast_left": {
+            "range_m": levels[0].ranges_m.round(3).tolist(),
+            "green": [level.contrast[:, 1].round(5).tolist() for level in levels],
+        },
+    }
     write_json(folder / "turbidity.json", results)
     draw(levels, folder / "turbidity.png")
     return results

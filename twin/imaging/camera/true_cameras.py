@@ -125,12 +125,15 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     folds the image back onto itself, or the field of view is too wide.
     """
     believed_rig, calibration = scenario.believed_rig(), scenario.true_calibration_error()
-    _check_port(scenario.port)
+    port, exact = scenario.port, calibration.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
+    if port.kind == "dome" and np.linalg.norm(port.offset_m) >= port.radius_m:
+        reason = f"{np.linalg.norm(port.offset_m):g} m: the lens is outside its dome"
+        raise TwinError("port.offset_m", reason, f"shorter than port.radius_m, {port.radius_m:g} m")
     true_rig = replace(believed_rig, baseline_m=believed_rig.baseline_m * (1 + calibration.baseline_error))
     models, believed = _models(scenario)
-    calibrated = scenario.port.kind != "none" and scenario.port.calibrated_at_m > 0
-    depth_m = scenario.port.calibrated_at_m if calibrated else 1.0
-    if _is_ideal(scenario, believed):
+    calibrated = port.kind != "none" and port.calibrated_at_m > 0
+    depth_m = port.calibrated_at_m if calibrated else 1.0
+    if exact and port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens):
         return TrueCameras(true_rig, (0, 0), true_rig, None, None, models, believed, depth_m)
     rectification = None
     border = np.zeros(2, np.int64)
@@ -177,11 +180,6 @@ def right_rotation(calibration: CalibrationErrorConfig) -> Array:
     roll, pitch, yaw = np.deg2rad([calibration.right_roll_deg, calibration.right_pitch_deg, calibration.right_yaw_deg])
     x, y, z = np.eye(3)
     return geometry.so3_exp(yaw * y) @ geometry.so3_exp(pitch * x) @ geometry.so3_exp(roll * z)
-
-
-def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
-    same = scenario.true_calibration_error().model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
-    return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 
 
 @lru_cache(maxsize=1)  # the surveys of a study mostly differ in other keys
@@ -250,9 +248,3 @@ def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64
         degrees = 2 * np.rad2deg(np.arctan([half.max(), WIDEST_TANGENT]))
         raise TwinError("rig.hfov_deg", f"the true field of view is {degrees[0]:.0f} deg", f"up to {degrees[1]:.0f}")
     return margin
-
-
-def _check_port(port: PortConfig) -> None:
-    if port.kind == "dome" and np.linalg.norm(port.offset_m) >= port.radius_m:
-        reason = f"{np.linalg.norm(port.offset_m):g} m: the lens is outside its dome"
-        raise TwinError("port.offset_m", reason, f"shorter than port.radius_m, {port.radius_m:g} m")

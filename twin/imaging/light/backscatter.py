@@ -32,15 +32,10 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
     total = total * water.scattering_per_m * np.exp(-water.camera_loss_per_m * range_m[..., None])
     if water.multiple:
         return total
-    loss = np.exp(-lamps.sources.daylight.camera_loss_per_m * range_m[..., None])
-    return total + _of_daylight(lamps, water, ray, points) * loss
-
-
-def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> Array:
     day = lamps.sources.daylight
-    phase = phase_at(water.scatterers, -ray[..., 2])
     light = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[..., 2:])
-    return light * phase[..., None, :] * water.scattering_per_m
+    scattered = light * phase_at(water.scatterers, -ray[..., 2])[..., None, :] * water.scattering_per_m
+    return total + scattered * np.exp(-day.camera_loss_per_m * range_m[..., None])
 
 
 def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
