@@ -100,7 +100,7 @@ MUTANTS = [
         ("twin/imaging/camera/sensor.py", "np.sqrt(read_variance + shot_variance * signal)", "np.sqrt(read_variance + shot_variance)", "imaging_sensor"),
         ("twin/imaging/camera/sensor.py", "self.share = 1 - np.exp(-1 / (frame_rate_hz * lag_s))", "self.share = np.exp(-1 / (frame_rate_hz * lag_s))", "imaging_sensor"),
         ("twin/imaging/camera/lens.py", "3 * lens.k1, 5 * lens.k2, 7 * lens.k3", "3 * lens.k1, 3 * lens.k2, 7 * lens.k3", "imaging_lens"),
-        ("twin/imaging/light/backscatter.py", "return light * phase[..., None, :] * water.scattering_per_m", "return light * phase[..., None, :] * water.scattering_per_m / 2", "imaging_optics"),
+        ("twin/imaging/light/backscatter.py", "return total + scattered * np.exp(", "return total + scattered / 2 * np.exp(", "imaging_optics"),
         ("twin/imaging/scene/object_view.py", "vertices[:, 2] -= deflection**2 / (2 * height_m)", "vertices[:, 2] -= deflection**2 / height_m", "imaging_sway"),
         ("twin/imaging/reference/directions.py", "low, high = (k / cells) ** 4, ((k + 1) / cells) ** 4", "low, high = (k / cells) ** 2, ((k + 1) / cells) ** 2", "imaging_reference imaging_photons"),
         # estimators
@@ -131,7 +131,7 @@ MUTANTS = [
         ("twin/estimate/link_selection.py", "return 1 / (1 - min(overlap, _LARGEST_OVERLAP))", "return 1 / (2 - min(overlap, _LARGEST_OVERLAP))", "estimate_positioning"),
         ("twin/estimate/self_check.py", "quality.frames_lost / max(n, 1), MAX_FRAMES_LOST", "quality.frames_lost / max(2 * n, 1), MAX_FRAMES_LOST", "estimate_self_check"),
         # judge
-        ("twin/judge/consistency.py", "in_camera = np.einsum(\"nji,nj->ni\"", "in_camera = np.einsum(\"nij,nj->ni\"", "judge_metrics judge_trajectory"),
+        ("twin/judge/consistency.py", "error, cov = np.einsum(\"nji,nj->ni\"", "error, cov = np.einsum(\"nij,nj->ni\"", "judge_metrics judge_trajectory"),
         ("twin/judge/consistency.py", "tail = (1 - CONSISTENT_SHARE) / 2", "tail = 1 - CONSISTENT_SHARE", "judge_metrics judge_trajectory"),
         ("twin/judge/map_error.py", "1.4826 * np.median(np.abs(error - np.median(error)))", "1.4826 * np.median(np.abs(error))", "judge_metrics judge_true_map"),
         ("twin/judge/map_error.py", "percent, method=\"higher\")", "percent, method=\"lower\")", "judge_area judge_metrics"),
