@@ -45,6 +45,17 @@ def test_a_wrong_value_is_one_line_with_the_key():
         twin.plan(twin.load_scenario("reef"), seed=2)
 
 
+def test_an_empty_section_is_that_of_the_defaults():
+    assert twin.load_scenario("reef").imu is None
+    assert twin.load_scenario("reef", imu={}).imu is not None and twin.load_scenario("reef", imu=None).imu is None
+
+
+@pytest.mark.parametrize("value", [{1}, object(), [None]])
+def test_a_value_that_no_file_can_have_is_one_line_with_the_key(value):
+    with pytest.raises(ScenarioError, match=r"plan\.polygon: Unable to convert .*allowed: a value of TOML"):
+        twin.load_scenario("reef", plan={"polygon": value})
+
+
 def test_a_changed_copy_of_a_scenario_is_validated():
     scenario = twin.load_scenario("reef")
     assert scenario.model_copy(update={"seed": 7}).seed == 7 and scenario.seed != 7

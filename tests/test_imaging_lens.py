@@ -188,6 +188,7 @@ BAD_LENSES = [
     ("k1 = 3.0", "lens.k1: 3.0: not allowed (allowed: less than or equal to 2)"),
     ('p1 = "a"', "lens.p1: 'a': not allowed (allowed: a number)"),
     ("k4 = 0.1", "lens.k4: unknown key (allowed: k1, k2, k3, p1, p2, diffraction, blur_px, lateral_colour, focus_m)"),
+    ("p1 = 0.2", "lens.p1: the lens folds the image back within the sensor (allowed: less distortion)"),
     ("k1 = -1.2", "lens.k1: the believed lens folds the image back within the frame (allowed: less distortion)"),
 ]
 

@@ -432,6 +432,11 @@ def test_where_all_cells_changed_no_share_of_false_ones_is_stated(runs):
     assert not any("of the unchanged cells" in item for one in results.paragraphs for item in one.items)
 
 
+def test_changes_larger_than_the_map_are_looked_for_in_the_whole_map(runs):
+    results = [pages.change_of(*runs, scale_m) for scale_m in (100.0, 1000.0)]
+    assert results[0].tree["patches"] == results[1].tree["patches"]
+
+
 def test_a_scale_also_acts_on_heights():
     """A map with relief of 0.5 m, scaled by 1 % in all three axes about its centre."""
     rng, (x, y) = np.random.default_rng(1), coordinates()

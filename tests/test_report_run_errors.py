@@ -8,9 +8,10 @@ from judge_synthetic import SCENARIO, write_folder
 
 from twin.core import geometry
 from twin.core.records import Trajectory
+from twin.errors import TwinError
 from twin.judge.recorded import recorded_errors
 from twin.judge.trajectory_errors import path_errors
-from twin.report import recording, run_comparison, survey_figures
+from twin.report import headline, recording, run_comparison, stage_tables, survey_figures
 from twin.report.headline import REPLAY_ALIGNMENTS
 from twin.report.run_folder import load_run
 from twin.report.survey_page import context
@@ -63,3 +64,17 @@ def test_the_page_states_the_alignment_of_the_curves(run):
     assert context(run)["alignment"] == "anchored at the first true pose"
     replayed = replace(run, metrics=run.metrics | {"replay": {"alignment": "none"}})
     assert context(replayed)["alignment"] == REPLAY_ALIGNMENTS["none"]
+
+
+@pytest.mark.parametrize("row", ["0.1 nan 0 0 0 0 0 1", "nan 0 0 0 0 0 0 1", "0.1 0 0", "# nothing else"])
+def test_a_trajectory_without_numbers_is_refused(tmp_path, row):
+    folder = write_folder(tmp_path / "run")
+    (folder / "trajectory_final.tum").write_text(row + "\n")
+    with pytest.raises(TwinError, match="trajectory_final.tum"):
+        load_run(folder)
+
+
+def test_unknown_stages_and_sources_of_an_edited_run_are_shown(run):
+    timing = {"stages": {"other": {"count": 1}}, "keyframes": 0}
+    assert stage_tables.stage_times({"timing": timing}, {}, None)[0].mean_ms is None
+    assert headline.conditions({"water": {"source": "other"}}, 3.0)

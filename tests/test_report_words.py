@@ -9,6 +9,7 @@ import pytest
 from twin.judge.metrics import empty_metrics
 from twin.judge.verdict import numbers_of
 from twin.report.html import lines_of, render_paragraphs
+from twin.report.number_formats import milliseconds
 from twin.report.words import label, values_in_words, with_words, words
 from twin.scenario.model import Scenario
 
@@ -86,3 +87,7 @@ def test_paragraphs_have_a_title_a_text_and_items():
     assert (differs.text, differs.items) == ("Nothing.", [])
     first, second, third = lines_of(paragraphs).splitlines()
     assert first == compared and re.match(r"How sure is it\? To tell", second) and third.endswith("Nothing.")
+
+
+def test_milliseconds_become_seconds_where_they_round_to_one():
+    assert [milliseconds(value) for value in (999.4, 999.6, 1000.0)] == ["999 ms", "1.00 s", "1.00 s"]

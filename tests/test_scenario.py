@@ -543,3 +543,27 @@ def test_the_objects_of_a_base_file_stay_on_its_floor(tmp_path, text, overrides,
     assert len(scenario.objects) == (len(load_scenario("quickstart").objects) if inherits else 0)
     file.write_text(f'extends = "quickstart"\n{text}\n[[objects]]\nshape = "crate"\nposition_m = [0.0, 0.0]\n')
     assert [item.shape for item in load_scenario(file).objects] == ["crate"]
+
+
+def test_a_drawn_calibration_error_lies_within_the_limits_of_its_key():
+    keys = ["calibration_error.rotation_sigma_deg=2", "calibration_error.baseline_sigma_mm=20", "rig.baseline_m=0.03"]
+    drawn = [load_scenario("reef", [*keys, f"seed={k}"]).true_calibration_error() for k in range(40)]
+    assert max(abs(one.baseline_error) for one in drawn) == 0.5
+    assert max(abs(one.right_pitch_deg) for one in drawn) <= 5
+
+
+@pytest.mark.parametrize("name", ["2020.10", "1_0", "0x10", "true"])
+def test_a_file_may_have_the_name_of_a_number(name):
+    assert Path(load_scenario("reef", [f"terrain.height_file={name}"]).terrain.height_file).name == name
+
+
+@pytest.mark.parametrize(("override", "lines"), [
+    ("control.latency=9", ["'none' or 'stated'", "less than or equal to 5"]),
+    ("plan.polygon=[[1e6,0],[0,0],[0,1]]", ["a list of corners [x, y], or a GeoJSON file"]),
+])  # fmt: skip
+def test_an_error_in_a_key_with_several_types_has_the_name_of_the_key(override, lines):
+    with pytest.raises(ScenarioError) as error:
+        load_scenario("reef", [override])
+    key = override.partition("=")[0]
+    assert [line.rpartition("(allowed: ")[2][:-1] for line in error.value.lines] == lines
+    assert all(line.startswith(f"--set: {key}: ") for line in error.value.lines)

@@ -12,6 +12,7 @@ from twin.core import geometry
 from twin.core.records import Estimate
 from twin.core.settings import braking_factor
 from twin.errors import ScenarioError
+from twin.planning.summary import summarise
 from twin.planning.vehicle_limits import rows, vehicle_limits
 from twin.scenario.file import load_scenario
 from twin.session.mission_actions import MissionActions
@@ -201,3 +202,7 @@ def test_the_start_points_along_the_velocity_through_the_mean_current():
     assert yaw == pytest.approx(np.arctan2(-0.25, 1.1))
     assert auv().start_velocity_mps == pytest.approx([1.2, 0.0, 0.0])
     assert replace(mission, scenario=auv().scenario).start_of_body[1, 0] == pytest.approx(0.0)
+
+
+def test_the_plan_of_a_vehicle_that_never_holds_has_no_station_keeping():
+    assert summarise(auv()).hold_s == 0.0

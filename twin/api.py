@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from twin.errors import SurveyAborted, TwinError
+from twin.errors import ScenarioError, SurveyAborted, TwinError
 
 if TYPE_CHECKING:
     from twin.app.look import ViewLayers
@@ -285,10 +285,13 @@ def _texts(values: Overrides) -> Iterator[str]:
         yield from values
         return
     for key, value in values.items():
-        if isinstance(value, Mapping) and key != "require":
+        if isinstance(value, Mapping) and value and key != "require":
             yield from _texts({f"{key}.{name}": inner for name, inner in value.items()})
         elif value is not None:
-            yield f"{key}={_toml(value).as_string()}"
+            try:
+                yield f"{key}={_toml(value).as_string()}"
+            except ValueError as error:
+                raise ScenarioError([f"{key}: {error} (allowed: a value of TOML)"]) from None
 
 
 def _toml(value: Any) -> Any:

@@ -482,7 +482,7 @@ def compare(
 @app.command()
 def products(
     folder: RunFolder,
-    level_m: Annotated[float | None, option("Height of the plane below the volume.", "M", "--level")] = None,
+    level_m: Annotated[float | None, option("Height of the lower plane.", "M", "--level", min=-1e5, max=1e5)] = None,
     out: Annotated[Path | None, option("Folder to write. Default: RUN/products.")] = None,
     as_json: SummaryJson = False,
 ) -> None:

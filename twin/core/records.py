@@ -277,6 +277,8 @@ class Trajectory:
     @staticmethod
     def load(path: Path) -> "Trajectory":
         rows = np.loadtxt(path, ndmin=2)
+        if rows.shape[1] != 8 or not np.isfinite(rows).all():
+            raise ValueError(f"{path.name} has no rows of 8 finite numbers")
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, :3] = geometry.rotation_from_wxyz(rows[:, [7, 4, 5, 6]])
         poses[:, :3, 3] = rows[:, 1:4]

@@ -53,7 +53,7 @@ def planned_path(mission: Mission, origin: Georeference | None) -> PlannedPath:
         np.column_stack([easting, northing, origin.elevation_m + scene_m[:, 2]]),
         transformed(origin.crs_wkt, WGS84, easting, northing),
         np.degrees(np.arctan2(bow[:, 0], bow[:, 1])) % 360,
-        mission.scenario.control.hold_s * np.append(np.diff(track) > 0, True),
+        mission.scenario.control.hold_s * (np.append(np.diff(track) > 0, True) & (not mission.plan.flies_arcs)),
     )  # fmt: skip
 
 

@@ -86,7 +86,8 @@ class PlanSummary:
 
     @property
     def hold_s(self) -> float:
-        return self.mission.scenario.control.hold_s * len(self.mission.tracks)
+        holds = not self.mission.plan.flies_arcs
+        return holds * self.mission.scenario.control.hold_s * len(self.mission.tracks)
 
 
 def summarise(mission: Mission) -> PlanSummary:

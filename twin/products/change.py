@@ -97,7 +97,8 @@ def change_between(first: Heights, second: Heights, scale_m: float) -> Change:
 
     Raises TwinError as `register` does, or if too few cells are unchanged.
     """
-    everywhere, side = np.ones(first.height_m.shape, bool), max(round(scale_m / first.grid.cell_m), 1)
+    everywhere, most = np.ones(first.height_m.shape, bool), max(first.height_m.shape)
+    side = min(max(round(scale_m / first.grid.cell_m), 1), most)
     of_maps = register(first, second, everywhere)
     weights = _weights(np.where(np.isfinite(of_maps.difference_m), of_maps.sigma_m, 0.0))
     ratio = _weighted_mean(np.nan_to_num(of_maps.difference_m), weights, side) * np.sqrt(_mean(weights, side))

@@ -119,5 +119,5 @@ def input_rows(stated: Mapping[str, Any]) -> list[tuple[str, str]]:
 def conditions(scenario: Mapping[str, Any], visibility_m: float | None = None) -> str:
     """Returns the conditions of a survey as text: altitude, rig, water type with source of its table, clarity."""
     source = scenario.get("water", {}).get("source")
-    known = {"scenario": scenario, "visibility_m": visibility_m, "source": WATER_SOURCES[source] if source else None}
+    known = {"scenario": scenario, "visibility_m": visibility_m, "source": WATER_SOURCES.get(source)}
     return " ".join(render_text("conditions.txt.j2", known).split())

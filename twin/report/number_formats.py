@@ -56,7 +56,7 @@ def ratio(value: float | None) -> str:
 
 def milliseconds(value_ms: float | None) -> str:
     """Returns a duration as text, in ms if shorter than one second, otherwise in s; a dash for None."""
-    return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"
+    return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 999.5 else f"{value_ms / 1e3:.2f} s"
 
 
 def duration(time_s: float) -> str:

@@ -306,7 +306,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     if new_key := _renamed(key):
         raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
     value = _override_value(key, text)
-    value = str(value) if _is_path_key(key) and not isinstance(value, list) else value
+    value = value if isinstance(value, list | str) or not _is_path_key(key) else text.strip()
     _assign(tree, key, _absolute(key, value, Path.cwd()), f"--set {shown(override)}")
     _take_models(tree, tree, Path.cwd(), lambda error: f"--set: {error}")
 
@@ -364,7 +364,8 @@ def _renamed(key: str) -> str | None:
 
 
 def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
-    field = ".".join(str(part) for part in item["loc"])
+    parts = (str(part) for part in item["loc"])  # with those of pydantic for the alternatives of a value
+    field = ".".join(part for part in parts if not part.startswith(("literal[", "constrained-")))
     if item["type"] == "extra_forbidden":
         allowed = _fields(item["loc"][:-1], model)
         return TwinError(field, f"unknown key{did_you_mean(str(item['loc'][-1]), allowed)}", ", ".join(allowed))

@@ -963,10 +963,10 @@ class PlanConfig(Section):
     @field_validator("polygon", mode="before")
     @classmethod
     def _require_corners(cls, value: Any) -> Any:
-        """Requires None, a string or a list of pairs of finite numbers; pydantic would list several errors."""
+        """Requires None, a string or a list of pairs of numbers up to 1e5; pydantic would list several errors."""
         if isinstance(value, list | tuple):
             corners = all(isinstance(corner, list | tuple) and len(corner) == 2 for corner in value)
-            numbers = corners and all(type(c) in (int, float) and math.isfinite(c) for pair in value for c in pair)
+            numbers = corners and all(type(c) in (int, float) and abs(c) <= 1e5 for pair in value for c in pair)
         else:
             numbers = value is None or isinstance(value, str)
         if not numbers:
@@ -1277,17 +1277,16 @@ class Scenario(Section):
             return error
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(_CALIBRATION_STREAM,)))
         roll, pitch, yaw, baseline = rng.standard_normal(4).tolist()
-        sigma = error.baseline_sigma_mm / 1000 / self.rig.baseline_m
-        return error.model_copy(
-            update={
-                "right_roll_deg": error.right_roll_deg + error.rotation_sigma_deg * roll,
-                "right_pitch_deg": error.right_pitch_deg + error.rotation_sigma_deg * pitch,
-                "right_yaw_deg": error.right_yaw_deg + error.rotation_sigma_deg * yaw,
-                "baseline_error": error.baseline_error + sigma * baseline,
-                "rotation_sigma_deg": 0.0,
-                "baseline_sigma_mm": 0.0,
-            }
-        )
+        rotation, sigma = error.rotation_sigma_deg, error.baseline_sigma_mm / 1000 / self.rig.baseline_m
+        drawn = {
+            "right_roll_deg": error.right_roll_deg + rotation * roll,
+            "right_pitch_deg": error.right_pitch_deg + rotation * pitch,
+            "right_yaw_deg": error.right_yaw_deg + rotation * yaw,
+            "baseline_error": error.baseline_error + sigma * baseline,
+        }
+        most = {"baseline_error": 0.5}  # limits of the keys
+        within = {name: float(np.clip(value, -most.get(name, 5), most.get(name, 5))) for name, value in drawn.items()}
+        return error.model_copy(update={**within, "rotation_sigma_deg": 0.0, "baseline_sigma_mm": 0.0})
 
     def believed_rig(self) -> StereoRig:
         """Returns the calibration that the estimators use; the true cameras differ from it by the calibration error."""

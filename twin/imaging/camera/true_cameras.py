@@ -192,7 +192,13 @@ def _rectification(believed: CameraModel, size_px: tuple[int, int], focal_px: fl
         return positions
     if np.isnan(believed._replace(lens=Distortion()).pixels(points_m)).any():
         raise TwinError("rig.hfov_deg", "no rays reach the corners of the frame through the port", "less")
-    raise TwinError("lens.k1", "the believed lens folds the image back within the frame", "less distortion")
+    raise TwinError(
+        _strongest(believed.lens), "the believed lens folds the image back within the frame", "less distortion"
+    )
+
+
+def _strongest(lens: Distortion) -> str:
+    return "lens." + max(lens._fields, key=lambda name: abs(getattr(lens, name)))
 
 
 @lru_cache(maxsize=1)  # as of `_rectification`; both cameras mostly have the same lens and port
@@ -201,7 +207,7 @@ def _sensor_rays(camera: CameraModel, size_px: tuple[int, int], border: tuple[in
     pixels = _grid(size_px, border)
     distorted = (pixels - camera.principal_px) / camera.focal_px
     if np.isnan(lenses.undistort(distorted, camera.lens)).any():
-        raise TwinError("lens.k1", "the lens folds the image back within the sensor", "less distortion")
+        raise TwinError(_strongest(camera.lens), "the lens folds the image back within the sensor", "less distortion")
     return camera.rays(pixels)
 
 
