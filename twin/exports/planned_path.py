@@ -48,12 +48,13 @@ def planned_path(mission: Mission, origin: Georeference | None) -> PlannedPath:
     scene_m, yaw, track = np.concatenate(positions), np.concatenate(yaws), np.concatenate(tracks)
     easting, northing = origin.from_scene(*scene_m[:, :2].T)
     bow = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]) @ place.north_from_scene.T
+    hold_s = 0.0 if mission.plan.flies_arcs else mission.scenario.control.hold_s
     return PlannedPath(
         mission.scenario.name, mission.plan.speed_mps, track, scene_m,
         np.column_stack([easting, northing, origin.elevation_m + scene_m[:, 2]]),
         transformed(origin.crs_wkt, WGS84, easting, northing),
         np.degrees(np.arctan2(bow[:, 0], bow[:, 1])) % 360,
-        mission.scenario.control.hold_s * (np.append(np.diff(track) > 0, True) & (not mission.plan.flies_arcs)),
+        hold_s * np.append(np.diff(track) > 0, True),
     )  # fmt: skip
 
 

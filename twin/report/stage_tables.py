@@ -97,8 +97,8 @@ def stage_times(
     budgets_ms = {"f2f": 1e3 / rate_hz if rate_hz else None, "ga": 1e3 * hold_s if hold_s else None}
     keyframe_ms = 1e3 * n_frames_per_keyframe / rate_hz if n_frames_per_keyframe and rate_hz else None
     rows = [
-        StageTime(name, *(row.get(key) for key in ("count", "mean_ms", "p95_ms", "total_s")), budgets_ms.get(name))
-        for name, row in stages.items()
+        StageTime(name, get("count"), get("mean_ms"), get("p95_ms"), get("total_s"), budgets_ms.get(name))
+        for name, get in ((name, row.get) for name, row in stages.items())
     ]
     work_s = sum(stages.get(name, {}).get("total_s") or 0.0 for name in KEYFRAME_STAGES)
     n_keyframes = timing.get("keyframes") or 0
