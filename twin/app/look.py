@@ -119,10 +119,10 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
     These are position of the left camera in the world [m] and median depth [m]; with a section [sensor], exposure time
     [ms] and analogue gain; and lists of three values for R, G, B, where None is an undefined value. `gray_level`: mean,
     as a fraction of full scale. `contrast`: median over the image of local standard deviation / local mean, without
-    noise, in windows of about `WINDOW_SHARE` of the image width. `veil_share`: fraction of the light that is
-    backscatter. `saturated_share`: fraction of saturated pixels. `snr`: mean / standard deviation of the noise.
-    `texture_snr`: median local standard deviation of the image without noise / standard deviation of the noise; a low
-    value limits matching.
+    noise (with a linear tone curve also without motion blur), in windows of about `WINDOW_SHARE` of the image width.
+    `veil_share`: fraction of the light that is backscatter. `saturated_share`: fraction of saturated pixels. `snr`:
+    mean / standard deviation of the noise. `texture_snr`: median local standard deviation of the image without noise /
+    standard deviation of the noise; a low value limits matching.
     """
     a, left = view.decomposed, view.stereo_pair.left
     signal = a.components.total.astype(np.float64) * a.setting.gain if a.linear else a.noise_free / 255
