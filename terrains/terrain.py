@@ -112,7 +112,7 @@ class Terrain:
         return self.colours.image if isinstance(self.colours, PaintedTexture) else self.colours
 
     def texture_within(self, low_m: Array, high_m: Array) -> Image:
-        """Returns `colours` as an image, which is painted at least between two corners (x, y) [m], and 4 texels on."""
+        """Returns `colours` as an image, painted at least between two corners (x, y) [m] and 4 texels around."""
         if not isinstance(self.colours, PaintedTexture):
             return self.colours
         (rows, cols, _), corner_m = self.colours.shape, [self.west_m, self.south_m]

@@ -3,6 +3,7 @@
 import csv
 import math
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,9 @@ class _CalibrationLoader(yaml.SafeLoader):
         return super().construct_document(node)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for name in [name for k, name in enumerate(names) if name in names[:k]]:
-            raise yaml.YAMLError(f"{name[:50]!r} is given twice")
+        names = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if repeated := [name for name, count in names.items() if count > 1]:
+            raise yaml.YAMLError(f"{repeated[0][:50]!r} is given twice")
         return super().construct_mapping(node, deep)
 
 

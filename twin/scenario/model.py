@@ -784,7 +784,7 @@ class WavesConfig(Section):
     wind_mps: float | None = Field(default=None, gt=0, le=60)
     """wind 10 m above the sea over fetch_m, from which height and period follow (Hasselmann et al. 1973) [m/s]"""
     fetch_m: float | None = Field(default=None, ge=100, le=1e6)
-    """distance over which the wind blows, with wind_mps [m]"""
+    """distance over which the wind blows, with wind_mps; it counts up to that of a fully developed sea [m]"""
     peak_enhancement: float = Field(default=3.3, ge=1, le=7)
     """peak of the spectrum relative to a fully developed sea; 3.3: mean of JONSWAP, 1: Pierson-Moskowitz"""
     direction_deg: float = Field(default=0.0, ge=-360, le=360)

@@ -316,9 +316,9 @@ def _check_path(
     if (sea := errors.attempt(make_sea, scenario)) is not None:
         start_m = plan.reference(1, 0.0).position
         errors.attempt(check_thrust, scenario.vehicle, sea, plan, tether_of(scenario.tether, start_m))
-    camera_m = scenario.believed_rig().body_from_camera[:3, 3]
+    camera_m, planned = scenario.believed_rig().body_from_camera[:3, 3], plan.all_references()
     for k, lamp in enumerate(scenario.lamps):
-        errors.attempt(check_lamp, k, np.array(lamp.position_m), camera_m, terrain, plan)
+        errors.attempt(check_lamp, k, np.array(lamp.position_m), camera_m, terrain, planned)
 
 
 def _grid(cell_m: float, plan: SurveyPlan, floors: Iterable[terrains.Terrain]) -> MapGrid:

@@ -9,6 +9,7 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 from scipy.optimize import root_scalar
 
 from twin.controllers.forecast import Clearance, least_clearance
+from twin.controllers.segments import Reference
 from twin.controllers.survey_plan import SurveyPlan
 from twin.core.geometry import Array
 from twin.errors import TwinError
@@ -208,9 +209,9 @@ def check_below_surface(scenario: Scenario, plan: SurveyPlan) -> None:
             raise TwinError(key, f"{depth_m:g}: the cameras are above the surface", f"more than {highest_m:.2f}")
 
 
-def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain, plan: SurveyPlan) -> None:
-    """Raises TwinError if a lamp, at a position (3,) in the body, is below the floor on the path."""
-    planned, (forward, left, up) = plan.all_references(), position_m - camera_m
+def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain, planned: Reference) -> None:
+    """Raises TwinError if a lamp, at a position (3,) in the body, is below the floor at a planned frame."""
+    forward, left, up = position_m - camera_m
     c, s = np.cos(planned.yaw), np.sin(planned.yaw)
     x, y, z = planned.position.T + np.array([c * forward - s * left, s * forward + c * left, np.full(len(c), up)])
     above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
